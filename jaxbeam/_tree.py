@@ -1,0 +1,139 @@
+"""Frozen dataclasses as pytrees: floats are leaves, index arrays are structure.
+
+A field is one of three kinds:
+
+- data (the default): a leaf or a subtree that JAX traces and differentiates;
+- `index_field()`: an integer or boolean array. While it is a NumPy array it belongs to the *structure*
+  of the tree, compared by content, so `jax.grad` and `jax.vmap` of a scene meet only floats and scenes
+  on one mesh stack without copies of its topology. `unlock` turns index arrays into leaves: the solver
+  does so at its own jit boundary, where a new topology of the same shape must not compile again;
+- `static_field()`: a hashable value, such as a function.
+
+`jax.tree_util.register_dataclass` rebuilds objects through their constructor, which then sees tracers and
+placeholders. Here unflattening bypasses it, so a constructor can validate what a person passes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+T = TypeVar("T")
+
+
+def index_field(**kwargs: Any) -> Any:
+    """A dataclass field for an index array (structure while it is a NumPy array)."""
+    return dataclasses.field(metadata={"kind": "index"}, **kwargs)
+
+
+def static_field(**kwargs: Any) -> Any:
+    """A dataclass field for a hashable value that selects what is traced."""
+    return dataclasses.field(metadata={"kind": "static"}, **kwargs)
+
+
+class Key:
+    """A NumPy array hashed and compared by content."""
+
+    __slots__ = ("_hash", "array")
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.array = array
+        self._hash = hash((array.shape, array.dtype.str, array.tobytes()))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        return (
+            isinstance(other, Key)
+            and self._hash == other._hash
+            and self.array.dtype == other.array.dtype
+            and np.array_equal(self.array, other.array)
+        )
+
+
+def pytree(cls: type[T]) -> type[T]:
+    """Register a frozen dataclass as a pytree node by the rules of this module."""
+    names: dict[str, list[str]] = {"data": [], "index": [], "static": []}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        names[field.metadata.get("kind", "data")].append(field.name)
+
+    def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], Any]:
+        children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in names["data"]]
+        keys = []
+        for name in names["index"]:
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                keys.append(_key(self, name, value))
+            else:
+                keys.append(None)
+                children.append((jax.tree_util.GetAttrKey(name), value))
+        return children, (tuple(keys), tuple(getattr(self, name) for name in names["static"]))
+
+    def unflatten(aux: Any, children: Any) -> Any:
+        keys, statics = aux
+        self = object.__new__(cls)
+        values = iter(children)
+        for name in names["data"]:
+            object.__setattr__(self, name, next(values))
+        for name, key in zip(names["index"], keys, strict=True):
+            object.__setattr__(self, name, next(values) if key is None else key.array)
+            if key is not None:
+                self.__dict__["_key_" + name] = key
+        for name, value in zip(names["static"], statics, strict=True):
+            object.__setattr__(self, name, value)
+        return self
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+    return cls
+
+
+def _key(owner: Any, name: str, array: np.ndarray) -> Key:
+    """The key of an index array, hashed once per owner."""
+    cache = owner.__dict__
+    slot = "_key_" + name
+    if slot not in cache:
+        cache[slot] = Key(array)
+    return cache[slot]
+
+
+def unlock(tree: T) -> T:
+    """The same tree with every index array a leaf, so that a jitted function is traced once per shape."""
+    if isinstance(tree, tuple | list):
+        return type(tree)(unlock(item) for item in tree)  # type: ignore[return-value]
+    if not dataclasses.is_dataclass(tree):
+        return tree
+    new = object.__new__(type(tree))
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if field.metadata.get("kind") == "index":
+            value = jnp.asarray(value)
+        elif "kind" not in field.metadata:
+            value = unlock(value)
+        object.__setattr__(new, field.name, value)
+    return new
+
+
+def replace(tree: T, **changes: Any) -> T:
+    """A copy with some data fields changed: like `dataclasses.replace`, but nothing is validated again."""
+    new = object.__new__(type(tree))
+    new.__dict__.update(tree.__dict__ | changes)
+    return new
+
+
+def is_concrete(*values: Any) -> bool:
+    """True if no value is a tracer, so that checks on numbers can run on the host."""
+    return not any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+def read_only(values: Any, dtype: Any = None) -> np.ndarray:
+    """A read-only NumPy copy, fit to be structure."""
+    array = np.array(values, dtype=dtype)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,389 @@
+"""Linear algebra of Newton's method: projection, assembly and symmetric positive definite factorisation.
+
+A linear solver is a value with three methods, `layout`, `factor` and `solve`. `Dense` and
+`BlockTridiagonal` share the assembly and differ in where an entry of the matrix is stored.
+
+Nodes are ordered by breadth-first levels from the clamp, which makes the Hessian of any mesh block
+tridiagonal (the level structure of Cuthill and McKee, 1969). Unknowns that couple far levels, such as
+the free ends of a long tendon, are moved to a border of a few columns that is eliminated last:
+
+    K = [ T   E ]     T block tridiagonal, S the border's own block.
+        [ E^T S ]
+
+This is the exact counterpart of a low-rank (Woodbury) correction. It needs no `T` that is definite by
+itself and has no cancellation when a tendon is stiff: the Cholesky factor exists if and only if `K` is
+positive definite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxbeam._tree import Key, pytree, static_field
+
+
+def project_semidefinite(hessians: jax.Array) -> jax.Array:
+    """Nearest positive semidefinite matrices in the Frobenius norm (Higham 1988): negative eigenvalues to 0.
+
+    Args:
+        hessians: symmetric `(m, s, s)`.
+    """
+    values, vectors = jnp.linalg.eigh(hessians)
+    return jnp.einsum("mik,mk,mjk->mij", vectors, jnp.maximum(values, 0), vectors)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Layout:
+    """Where unknowns and matrix entries are stored, for one topology.
+
+    slots `(N,)`: flat coordinate (node * d + axis) of each unknown; the value `n d` marks padding.
+    position `(n d,)`: unknown of each flat coordinate; the value `N` marks a fixed one.
+    scatter: for each term, `(m, (k d)^2)` places in the storage of its stencil Hessians; entries that are
+        fixed, or whose mirror image is stored, point past the end and are dropped.
+    diagonal `(N,)`: places of the diagonal.
+    empty `(size,)`: storage before assembly, as booleans: true on the diagonal of the padding.
+    blocks: number of blocks, their width and that of the border.
+    """
+
+    slots: jax.Array
+    position: jax.Array
+    scatter: tuple[jax.Array, ...]
+    diagonal: jax.Array
+    empty: jax.Array
+    blocks: tuple[int, int, int] = static_field()
+
+
+class LinearSolver(Protocol):
+    """What `Newton` asks of a linear solver. It must be hashable."""
+
+    def layout(self, topology: Topology) -> Layout: ...
+
+    def factor(self, layout: Layout, storage: jax.Array) -> tuple[Any, jax.Array]:
+        """Factor, and whether the matrix is positive definite to working precision."""
+        ...
+
+    def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array: ...
+
+
+class Topology(NamedTuple):
+    """What a layout depends on, hashable: elements, fixed coordinates and the nodes of every term."""
+
+    elements: Key
+    fixed: Key
+    stencils: tuple[Key, ...]
+
+
+def assemble(layout: Layout, hessians: list[jax.Array]) -> jax.Array:
+    """Storage of the sum of stencil Hessians `(m, k d, k d)`, one array for each term."""
+    places = jnp.concatenate([s.ravel() for s in layout.scatter])
+    values = jnp.concatenate([h.ravel() for h in hessians])
+    return layout.empty.astype(values.dtype).at[places].add(values, mode="drop")
+
+
+def gather(layout: Layout, field: jax.Array) -> jax.Array:
+    """Vector of unknowns `(N,)` of a nodal field `(n, d)`; zero in the padding."""
+    return jnp.append(field.ravel(), 0)[layout.slots]
+
+
+def expand(layout: Layout, unknowns: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Nodal field `(n, d)` of a vector of unknowns `(N,)`; zero where fixed."""
+    return jnp.append(unknowns, 0)[layout.position].reshape(shape)
+
+
+# ---------------------------------------------------------------------------------------------- dense
+
+
+@dataclasses.dataclass(frozen=True)
+class Dense:
+    """Dense Cholesky: for tests and tiny scenes. Time grows with the cube of the unknowns."""
+
+    def layout(self, topology: Topology) -> Layout:
+        return _dense_layout(topology)
+
+    def factor(self, layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array]:
+        size = layout.blocks[1]
+        factor = jnp.linalg.cholesky(storage.reshape(size, size), symmetrize_input=False)
+        return factor, jnp.isfinite(factor[-1, -1])
+
+    def solve(self, layout: Layout, factor: jax.Array, rhs: jax.Array) -> jax.Array:
+        half = lax.linalg.triangular_solve(factor, rhs[:, None], left_side=True, lower=True)
+        return lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
+
+
+@lru_cache(maxsize=32)
+def _dense_layout(topology: Topology) -> Layout:
+    fixed = topology.fixed.array.ravel()
+    slots = np.flatnonzero(~fixed)
+    size = slots.size
+    position = np.full(fixed.size, size)
+    position[slots] = np.arange(size)
+    scatter = []
+    for stencil in topology.stencils:
+        rows, columns = _stencil_pairs(position[_coordinates(stencil.array, topology)])
+        keep = (rows < size) & (columns < size)
+        scatter.append(np.where(keep, rows * size + columns, size * size))
+    return _device_layout(slots, position, scatter, np.arange(size) * (size + 1), np.zeros(size * size, bool), (1, size, 0))
+
+
+# --------------------------------------------------------------------------------- block tridiagonal
+
+
+class BorderedFactor(NamedTuple):
+    """`K = L L^T` by blocks: `pivot (b, w, w)` lower triangular diagonal blocks, `lower (b, w, w)` the blocks
+    left of them, `border (b, w, r)` the transposed rows of the border and `corner (r, r)` its own pivot."""
+
+    pivot: jax.Array
+    lower: jax.Array
+    border: jax.Array
+    corner: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockTridiagonal:
+    """Bordered block-tridiagonal Cholesky over the levels of the mesh.
+
+    `b` blocks of width `w` with `r` border columns take about `b w (7/3 w^2 + 2 w r + r^2)` multiplications,
+    and `2 b w^2` numbers of storage.
+    """
+
+    def layout(self, topology: Topology) -> Layout:
+        return _bordered_layout(topology)
+
+    def factor(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
+        b, w, r = layout.blocks
+        split = np.cumsum([b * w * w, b * w * w, b * w * r])
+        pieces = jnp.split(storage, split)
+        diagonal, lower = pieces[0].reshape(b, w, w), pieces[1].reshape(b, w, w)
+        border, corner = pieces[2].reshape(b, w, r), pieces[3].reshape(r, r)
+
+        def eliminate(carry: Any, block: Any) -> Any:
+            pivot, above, schur = carry
+            diagonal, lower, border = block
+            lower = lax.linalg.triangular_solve(pivot, lower, left_side=False, lower=True, transpose_a=True)
+            pivot = jnp.linalg.cholesky(diagonal - lower @ lower.T, symmetrize_input=False)
+            if r:
+                border = lax.linalg.triangular_solve(pivot, border - lower @ above, left_side=True, lower=True)
+                schur = schur - border.T @ border
+            return (pivot, border, schur), (pivot, lower, border)
+
+        start = (jnp.eye(w, dtype=storage.dtype), jnp.zeros((w, r), storage.dtype), corner)
+        (_, _, schur), (pivot, lower, border) = lax.scan(eliminate, start, (diagonal, lower, border))
+        corner = jnp.linalg.cholesky(schur, symmetrize_input=False) if r else schur
+        # A failed block is NaN, and so is everything after it.
+        ok = jnp.isfinite(corner[-1, -1]) if r else jnp.isfinite(pivot[-1, -1, -1])
+        return BorderedFactor(pivot, lower, border, corner), ok
+
+    def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
+        b, w, r = layout.blocks
+        inner, outer = rhs[: b * w].reshape(b, w, 1), rhs[b * w :, None]
+
+        def forward(above: jax.Array, block: Any) -> Any:
+            pivot, lower, right = block
+            y = lax.linalg.triangular_solve(pivot, right - lower @ above, left_side=True, lower=True)
+            return y, y
+
+        _, inner = lax.scan(forward, jnp.zeros((w, 1), rhs.dtype), (factor.pivot, factor.lower, inner))
+        if r:
+            outer = outer - jnp.einsum("bwr,bwc->rc", factor.border, inner)
+            outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True)
+            outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True, transpose_a=True)
+            inner = inner - factor.border @ outer
+
+        def backward(carry: jax.Array, block: Any) -> Any:
+            pivot, lower, right = block
+            y = lax.linalg.triangular_solve(pivot, right - carry, left_side=True, lower=True, transpose_a=True)
+            return lower.T @ y, y
+
+        start = jnp.zeros((w, 1), rhs.dtype)
+        _, inner = lax.scan(backward, start, (factor.pivot, factor.lower, inner), reverse=True)
+        return jnp.concatenate([inner.reshape(b * w), outer.reshape(r)])
+
+
+@lru_cache(maxsize=32)
+def _bordered_layout(topology: Topology) -> Layout:
+    fixed = topology.fixed.array
+    count, d = fixed.shape
+    free = ~fixed.all(axis=1)
+    block = _blocks(topology)
+    border_nodes = _border(topology, block)
+    on_border = np.zeros(count, bool)
+    on_border[border_nodes] = True
+    inner = free & ~on_border
+
+    coordinate_block = np.repeat(np.where(inner, block, -1), d)
+    coordinate_block[fixed.ravel()] = -1
+    order = np.argsort(coordinate_block, kind="stable")
+    order = order[coordinate_block[order] >= 0]
+    owner = coordinate_block[order]
+    starts = np.searchsorted(owner, np.arange(owner.max() + 1)) if owner.size else np.zeros(1, int)
+    within = np.arange(owner.size) - starts[owner]
+    b, w = (int(owner.max()) + 1, int(within.max()) + 1) if owner.size else (1, 1)
+    outer = np.flatnonzero(np.repeat(on_border, d) & ~fixed.ravel())
+    r = outer.size
+
+    size = b * w + r
+    slots = np.full(size, count * d)
+    slots[owner * w + within] = order
+    slots[b * w :] = outer
+    position = np.full(count * d, size)
+    used = slots < count * d
+    position[slots[used]] = np.flatnonzero(used)
+
+    total = 2 * b * w * w + b * w * r + r * r
+    lower_at, border_at, corner_at = b * w * w, 2 * b * w * w, 2 * b * w * w + b * w * r
+    scatter = []
+    for stencil in topology.stencils:
+        p, q = _stencil_pairs(position[_coordinates(stencil.array, topology)])
+        place = np.full(p.shape, total)
+        known = (p < size) & (q < size)
+        p_in, q_in = known & (p < b * w), known & (q < b * w)
+        bp, bq, sp, sq = p // w, q // w, p % w, q % w
+        both = p_in & q_in
+        same, below = both & (bp == bq), both & (bp == bq + 1)
+        if (both & (abs(bp - bq) > 1)).any():
+            raise AssertionError("a stencil couples blocks that are not neighbours")
+        place = np.where(same, (bp * w + sp) * w + sq, place)
+        place = np.where(below, lower_at + (bp * w + sp) * w + sq, place)
+        place = np.where(p_in & known & ~q_in, border_at + p * r + (q - b * w), place)
+        place = np.where(known & ~p_in & ~q_in, corner_at + (p - b * w) * r + (q - b * w), place)
+        scatter.append(place)
+    inner_slot = np.arange(b * w)
+    diagonal = np.concatenate([inner_slot * w + inner_slot % w, corner_at + np.arange(r) * (r + 1)])
+    empty = np.zeros(total, bool)
+    empty[diagonal[~used]] = True
+    return _device_layout(slots, position, scatter, diagonal, empty, (b, w, r))
+
+
+def _blocks(topology: Topology) -> np.ndarray:
+    """Block of each node: breadth-first levels, narrow neighbours merged. The cheapest of a few roots."""
+    fixed = topology.fixed.array
+    neighbours = _adjacency(fixed.shape[0], topology.elements.array)
+    weight = (~fixed).sum(axis=1)
+    roots = []
+    held = np.flatnonzero(fixed.any(axis=1))
+    if held.size:
+        pieces = _components(held, neighbours)
+        roots += [held, *pieces[:4]] if len(pieces) > 1 else [held]
+    far = _levels(np.array([0]), neighbours)
+    end = _levels(np.flatnonzero(far == far.max())[:1], neighbours)
+    roots += [np.flatnonzero(end == end.max())[:1], np.flatnonzero(end == end.max())]
+    best, best_cost = np.zeros(0, int), np.inf
+    for root in roots:
+        block = _merge(_levels(root, neighbours), weight)
+        width = np.bincount(block, weight).max()
+        cost = (block.max() + 1) * width**3
+        if cost < best_cost:
+            best, best_cost = block, cost
+    return best
+
+
+def _merge(level: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Join neighbouring levels while they fit the width of the widest, so that less is padding."""
+    widths = np.bincount(level, weight)
+    limit, block, filled = widths.max(), np.zeros(len(widths), int), 0.0
+    for k, width in enumerate(widths):
+        fits = filled + width <= limit
+        block[k] = (block[k - 1] if k else 0) + (0 if fits else 1)
+        filled = filled + width if fits else width
+    return block[level]
+
+
+def _adjacency(count: int, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Neighbours of each node in compressed rows: `(start, neighbour)`."""
+    k = elements.shape[1]
+    i, j = np.nonzero(~np.eye(k, dtype=bool))
+    pairs = np.unique(elements[:, i].ravel().astype(np.int64) * count + elements[:, j].ravel())
+    return np.searchsorted(pairs // count, np.arange(count + 1)), pairs % count
+
+
+def _levels(root: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Breadth-first level of each node; a further piece of the mesh continues the count."""
+    start, neighbour = neighbours
+    level = np.full(start.size - 1, -1)
+    front, depth = np.asarray(root), 0
+    while True:
+        level[front] = depth
+        reached = np.concatenate([neighbour[start[node] : start[node + 1]] for node in front])
+        front = np.unique(reached[level[reached] < 0])
+        depth += 1
+        if not front.size:
+            rest = np.flatnonzero(level < 0)
+            if not rest.size:
+                return level
+            front = rest[:1]
+
+
+def _components(nodes: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
+    """The connected groups of a subset of the nodes."""
+    start, neighbour = neighbours
+    left, groups = set(nodes.tolist()), []
+    while left:
+        stack, group = [min(left)], []
+        left.discard(stack[0])
+        while stack:
+            node = stack.pop()
+            group.append(node)
+            found = left.intersection(neighbour[start[node] : start[node + 1]].tolist())
+            left -= found
+            stack.extend(found)
+        groups.append(np.array(sorted(group)))
+    return groups
+
+
+def _border(topology: Topology, block: np.ndarray) -> np.ndarray:
+    """Nodes to eliminate last, so that every stencil keeps to two neighbouring blocks."""
+    free = ~topology.fixed.array.all(axis=1)
+    border: set[int] = set()
+    for stencil in topology.stencils:
+        nodes = stencil.array
+        low = np.where(free[nodes], block[nodes], np.iinfo(np.int64).max).min(axis=1)
+        high = np.where(free[nodes], block[nodes], -1).max(axis=1)
+        for k in np.flatnonzero(high - low > 1):
+            members = [n for n in dict.fromkeys(nodes[k].tolist()) if free[n] and n not in border]
+            # Keep the pair of blocks that holds most of the stencil; the others go to the border.
+            kept = max(
+                ([n for n in members if first <= block[n] <= first + 1] for first in sorted({block[n] for n in members})),
+                key=len,
+                default=[],
+            )
+            border.update(set(members) - set(kept))
+    return np.array(sorted(border), int)
+
+
+def _coordinates(stencil: np.ndarray, topology: Topology) -> np.ndarray:
+    """Flat coordinates `(m, k d)` of the nodes `(m, k)` of stencils."""
+    d = topology.fixed.array.shape[1]
+    return (stencil.astype(np.int64)[..., None] * d + np.arange(d)).reshape(len(stencil), -1)
+
+
+def _stencil_pairs(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column unknown `(m, s^2)` of each entry of stencil Hessians, from their unknowns `(m, s)`."""
+    m, s = unknowns.shape
+    return np.repeat(unknowns, s, axis=1), np.tile(unknowns, (1, s))
+
+
+def _device_layout(
+    slots: np.ndarray,
+    position: np.ndarray,
+    scatter: list[np.ndarray],
+    diagonal: np.ndarray,
+    empty: np.ndarray,
+    blocks: tuple[int, int, int],
+) -> Layout:
+    if empty.size >= 2**31 - 1:
+        raise ValueError(
+            f"mesh: its factor would hold {empty.size} numbers, more than 32-bit indices address; use a coarser mesh"
+        )
+    to_device = lambda a: jnp.asarray(a, jnp.int32)  # noqa: E731
+    # Cached across calls, so it must not be a tracer of the call that made it.
+    with jax.ensure_compile_time_eval():
+        places = tuple(to_device(s) for s in scatter)
+        return Layout(to_device(slots), to_device(position), places, to_device(diagonal), jnp.asarray(empty), blocks)

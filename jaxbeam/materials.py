@@ -1,0 +1,113 @@
+"""Elastic energy densities in plane strain, as pure functions of the displacement gradient.
+
+Each takes `H = F - I` `(2, 2)`, with `F` the deformation gradient, and `Lame` parameters, and returns the
+energy per unit rest volume (units of Young's modulus; thickness is 1). Written in `H`, small strains keep
+their digits: `|F|^2 - 2 = 2 tr H + |H|^2`, `J - 1 = tr H + det H`. All are differentiable to any order in
+`H` and in the parameters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxbeam._tree import is_concrete, pytree
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lame:
+    """Lame parameters: shear modulus `mu` and first parameter `lam`, scalars or one for each element."""
+
+    mu: jax.Array
+    lam: jax.Array
+
+
+def lame(young: ArrayLike, poisson: ArrayLike) -> Lame:
+    """Lame parameters of linear isotropic elasticity (any textbook, e.g. Bonet and Wood 2008, eq. 6.33).
+
+    Args:
+        young: Young's modulus, positive; scalar or `(t,)`, one for each element.
+        poisson: Poisson's ratio in (-1, 0.5); scalar or `(t,)`.
+
+    Returns:
+        `mu = E / (2 (1 + nu))`, `lam = E nu / ((1 + nu)(1 - 2 nu))`, differentiable in both.
+
+    Raises:
+        ValueError: if concrete values are outside their range.
+    """
+    _check_range("young", young, 0.0, np.inf, "a stiffness is positive")
+    _check_range("poisson", poisson, -1.0, 0.5, "0.5 is incompressible, where lam is infinite: use 0.4999, say")
+    young, poisson = jnp.asarray(young, float), jnp.asarray(poisson, float)
+    return Lame(young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson)))
+
+
+def lame_macklin_mueller(young: ArrayLike, poisson: ArrayLike) -> Lame:
+    """Parameters that make `macklin_mueller` behave as (young, poisson) at small strain.
+
+    Its linearisation has shear modulus `mu` and first parameter `lam - mu`, so `lam` is raised by `mu`.
+    With the plain `lame`, (1e4, 0.45) behaves as `E = 9962, nu = 0.4444`, (1e4, 0.3) as `8974, 0.167`, and
+    at `nu = 0` the in-plane bulk modulus vanishes. Arguments and errors as for `lame`.
+    """
+    plain = lame(young, poisson)
+    return Lame(plain.mu, plain.lam + plain.mu)
+
+
+def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
+    """Stable neo-Hookean, `mu/2 (|F|^2 - 2) - mu (J - 1) + lam/2 (J - 1)^2`.
+
+    Finite for every `F`, inverted ones too, so the smallest `J` must be watched. Linearised, its first
+    Lame parameter is `lam - mu`: see `lame_macklin_mueller`.
+
+    Source: Macklin and Mueller, "A constraint-based formulation of stable neo-Hookean materials", MIG 2021.
+    """
+    det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
+    volume = H[0, 0] + H[1, 1] + det
+    # mu/2 * 2 tr H and mu tr H cancel exactly; leaving both out keeps the digits of small strains.
+    return params.mu * (0.5 * jnp.sum(H * H) - det) + 0.5 * params.lam * volume**2
+
+
+def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
+    """Classical compressible neo-Hookean, `mu/2 (|F|^2 - 2) - mu ln J + lam/2 (ln J)^2`.
+
+    Domain `J > 0`; infinite as `J -> 0`, NaN below. Exact at small strain.
+
+    Source: Bonet and Wood, "Nonlinear Continuum Mechanics for Finite Element Analysis", 2008, eq. 6.27.
+    """
+    det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
+    volume = H[0, 0] + H[1, 1] + det
+    log_j = jnp.log1p(volume)
+    return params.mu * (0.5 * jnp.sum(H * H) - det + (volume - log_j)) + 0.5 * params.lam * log_j**2
+
+
+def saint_venant_kirchhoff(H: jax.Array, params: Lame) -> jax.Array:
+    """Saint Venant-Kirchhoff, `mu E:E + lam/2 (tr E)^2` with the Green strain `E = (H + H^T + H^T H)/2`.
+
+    Large rotations, small strains: it softens and inverts without resistance under strong compression.
+
+    Source: Bonet and Wood 2008, eq. 6.28.
+    """
+    strain = 0.5 * (H + H.T + H.T @ H)
+    return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
+
+
+def linear_elastic(H: jax.Array, params: Lame) -> jax.Array:
+    """Linear elasticity, `mu e:e + lam/2 (tr e)^2` with `e = (H + H^T)/2`: small rotations and strains only."""
+    strain = 0.5 * (H + H.T)
+    return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
+
+
+def _check_range(name: str, value: ArrayLike, low: float, high: float, why: str) -> None:
+    if not is_concrete(value):
+        return
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: expected a real number or array, got {value!r}")
+    bad = np.flatnonzero(~((array > low) & (array < high)))
+    if bad.size:
+        where = f" at element {bad[0]}" if array.ndim else ""
+        raise ValueError(f"{name}: expected a value in ({low:g}, {high:g}), got {array.ravel()[bad[0]]!r}{where}; {why}")

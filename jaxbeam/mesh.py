@@ -1,0 +1,229 @@
+"""Triangle meshes: rest positions of the nodes and the triangles that join them.
+
+Triangles are counter-clockwise, lengths are in the user's unit. Everything is checked here, on the host,
+once; what follows trusts a `Mesh`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxbeam._tree import index_field, is_concrete, pytree, read_only
+
+Diagonals = Literal["one-sided", "mirrored", "crossed"]
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mesh:
+    """Nodes and triangles of a body at rest.
+
+    Args:
+        nodes: `(n, 2)` rest positions, in the user's length unit. Their dtype is the dtype of every
+            computation on the mesh. May be traced: shape is differentiable.
+        elements: `(t, 3)` node numbers of each triangle, counter-clockwise. Always concrete.
+
+    Raises:
+        ValueError: if a shape or dtype is wrong, an index is out of range, a triangle repeats a node, is
+            listed twice or has an area that is not positive, a node is unused, two nodes coincide, or a
+            coordinate is not finite. Checks on positions are skipped while `nodes` is traced.
+    """
+
+    nodes: jax.Array
+    elements: np.ndarray = index_field()
+
+    def __post_init__(self) -> None:
+        elements = _checked_elements(self.elements)
+        nodes = self.nodes
+        if not isinstance(nodes, jax.Array):
+            nodes = np.asarray(nodes)
+            if nodes.dtype.kind not in "fiu":
+                raise ValueError(f"nodes: expected real numbers, got dtype {nodes.dtype}; convert with .astype(float)")
+            if nodes.dtype.kind != "f":
+                nodes = nodes.astype(float)
+        if nodes.ndim != 2 or nodes.shape[1] != 2:
+            raise ValueError(f"nodes: expected shape (n, 2), got {nodes.shape}; give one (x, y) row for each node")
+        _check_topology(nodes.shape[0], elements)
+        if is_concrete(nodes):
+            _check_geometry(np.asarray(nodes, dtype=np.float64), elements)
+        object.__setattr__(self, "nodes", jnp.asarray(nodes))
+        object.__setattr__(self, "elements", elements)
+
+
+def rectangle(
+    length: ArrayLike,
+    height: ArrayLike,
+    nx: int,
+    ny: int,
+    diagonals: Diagonals = "one-sided",
+    dtype: Any = None,
+) -> Mesh:
+    """Mesh of a rectangle centred on the origin, of `nx` x `ny` nodes.
+
+    Node `(i, j)`, column `i` from the left and row `j` from below, has number `i * ny + j`; the cell
+    centres of crossed diagonals follow after all of these.
+
+    Args:
+        length: extent in x, positive; may be traced.
+        height: extent in y, positive; may be traced.
+        nx: nodes along the length, at least 2.
+        ny: nodes along the height, at least 2.
+        diagonals: how a cell is split. `"one-sided"`: two triangles, by the diagonal from lower left to
+            upper right. `"mirrored"`: the same below mid-height and its mirror image above, so the mesh is
+            symmetric about mid-height (`ny` must be odd). `"crossed"`: four triangles about the centre.
+        dtype: of the nodes; by default JAX's float.
+
+    Returns:
+        A `Mesh`, differentiable in `length` and `height`.
+
+    Raises:
+        ValueError: if a count is not a whole number of at least 2, an extent is not positive and finite,
+            `diagonals` is unknown, or a mirrored mesh is asked for with an even `ny`.
+    """
+    for name, count in (("nx", nx), ("ny", ny)):
+        if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 2:
+            raise ValueError(f"{name}: expected a whole number of at least 2, got {count!r}")
+    for name, extent in (("length", length), ("height", height)):
+        if is_concrete(extent) and not (np.ndim(extent) == 0 and np.isfinite(extent) and np.asarray(extent) > 0):
+            raise ValueError(f"{name}: expected a positive finite number, got {extent!r}")
+    if diagonals not in ("one-sided", "mirrored", "crossed"):
+        raise ValueError(f"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got {diagonals!r}")
+    if diagonals == "mirrored" and ny % 2 == 0:
+        raise ValueError(
+            f"ny: expected an odd number for mirrored diagonals, got {ny}: no row of nodes lies at mid-height; "
+            f"use {ny + 1}, or crossed diagonals, which are symmetric for any ny"
+        )
+    unit_x, unit_y = np.meshgrid(np.linspace(-0.5, 0.5, nx), np.linspace(-0.5, 0.5, ny), indexing="ij")
+    unit = np.stack([unit_x.ravel(), unit_y.ravel()], axis=1)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(nx - 1), np.arange(ny - 1), indexing="ij"))
+    lower_left = i * ny + j
+    upper_left, lower_right, upper_right = lower_left + 1, lower_left + ny, lower_left + ny + 1
+    if diagonals == "crossed":
+        centre = nx * ny + np.arange(lower_left.size)
+        unit = np.concatenate([unit, (unit[lower_left] + unit[upper_right]) / 2])
+        corners = [lower_left, lower_right, upper_right, upper_left]
+        triangles = [(corners[k], corners[(k + 1) % 4], centre) for k in range(4)]
+    else:
+        falling = (diagonals == "mirrored") & (j >= (ny - 1) // 2)
+        triangles = [
+            (lower_left, lower_right, np.where(falling, upper_left, upper_right)),
+            (np.where(falling, lower_right, lower_left), upper_right, upper_left),
+        ]
+    elements = np.stack([np.stack(t, axis=1) for t in triangles], axis=1).reshape(-1, 3)
+    if dtype is None:
+        dtype = jnp.result_type(float)
+    extent = jnp.stack([jnp.asarray(length, dtype), jnp.asarray(height, dtype)])
+    return Mesh(jnp.asarray(unit, dtype) * extent, elements)
+
+
+def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Numbers of the nodes whose rest position satisfies `predicate(x, y)`, in increasing order.
+
+    Args:
+        mesh: with concrete nodes.
+        predicate: takes the `(n,)` coordinates and returns `(n,)` booleans.
+
+    Raises:
+        ValueError: if the predicate returns another shape or selects nothing, or the nodes are traced.
+
+    >>> left = nodes_where(rectangle(2.0, 1.0, 3, 2), lambda x, y: x < -0.99)
+    >>> [int(i) for i in left]
+    [0, 1]
+    """
+    x, y = _concrete_nodes(mesh).T
+    mask = np.asarray(predicate(x, y))
+    if mask.shape != x.shape or mask.dtype != bool:
+        raise ValueError(f"predicate: expected {x.shape} booleans, got shape {mask.shape} of dtype {mask.dtype}")
+    if not mask.any():
+        raise ValueError(
+            f"predicate: selects no node; x spans [{x.min():g}, {x.max():g}], y spans [{y.min():g}, {y.max():g}]"
+        )
+    return np.flatnonzero(mask)
+
+
+def nearest_node(mesh: Mesh, point: ArrayLike) -> int:
+    """Number of the node nearest to `point` `(2,)` at rest (the lowest number among equals).
+
+    Raises:
+        ValueError: if the point is not two finite numbers, or the nodes are traced.
+    """
+    target = np.asarray(point, dtype=float)
+    if target.shape != (2,) or not np.isfinite(target).all():
+        raise ValueError(f"point: expected two finite coordinates, got {point!r}")
+    return int(np.argmin(np.sum((_concrete_nodes(mesh) - target) ** 2, axis=1)))
+
+
+def _concrete_nodes(mesh: Mesh) -> np.ndarray:
+    if not is_concrete(mesh.nodes):
+        raise ValueError("mesh: its nodes are traced, so they cannot be selected by position; select before jit or grad")
+    return np.asarray(mesh.nodes, dtype=np.float64)
+
+
+def _checked_elements(elements: Any) -> np.ndarray:
+    if not is_concrete(elements):
+        raise ValueError("elements: expected concrete node numbers, got a traced array; build the mesh's topology outside")
+    array = np.asarray(elements)
+    if array.dtype.kind not in "iu":
+        raise ValueError(f"elements: expected whole numbers, got dtype {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise ValueError(f"elements: expected shape (t, 3) with t >= 1, got {array.shape}; give one row for each triangle")
+    if array.max() >= 2**31:
+        raise ValueError(f"elements: node numbers must fit 32 bits, got {array.max()}")
+    return read_only(array, np.int32)
+
+
+def _check_topology(count: int, elements: np.ndarray) -> None:
+    outside = np.flatnonzero(((elements < 0) | (elements >= count)).any(axis=1))
+    if outside.size:
+        k = outside[0]
+        raise ValueError(f"elements: triangle {k} is {elements[k].tolist()}, but nodes are numbered 0 to {count - 1}")
+    ordered = np.sort(elements, axis=1)
+    repeated = np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))
+    if repeated.size:
+        k = repeated[0]
+        raise ValueError(f"elements: triangle {k} repeats a node: {elements[k].tolist()}; remove it")
+    _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        k = int(first[counts > 1].min())
+        raise ValueError(f"elements: triangle {k}, {elements[k].tolist()}, is listed more than once; remove the copies")
+    used = np.zeros(count, bool)
+    used[elements] = True
+    if not used.all():
+        unused = np.flatnonzero(~used)
+        raise ValueError(
+            f"nodes: {unused.size} belong to no triangle, the first is node {unused[0]}; remove them and renumber"
+        )
+
+
+def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
+    if not np.isfinite(nodes).all():
+        k = np.flatnonzero(~np.isfinite(nodes).all(axis=1))[0]
+        raise ValueError(f"nodes: node {k} is not finite: {nodes[k].tolist()}")
+    extent = np.ptp(nodes, axis=0).max()
+    # Merging nodes closer than this is what mesh generators do; a real gap is far wider.
+    grid = np.round(nodes / (1e-9 * extent if extent > 0 else 1.0))
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.ravel()]
+    copies = np.flatnonzero(original != np.arange(len(nodes)))
+    if copies.size:
+        k = copies[0]
+        raise ValueError(
+            f"nodes: nodes {original[k]} and {k} coincide at {nodes[k].tolist()}; merge them, or the body is torn there"
+        )
+    a, b, c = nodes[elements[:, 0]], nodes[elements[:, 1]], nodes[elements[:, 2]]
+    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    bad = np.flatnonzero(area <= 1e-14 * extent**2)
+    if bad.size:
+        k = bad[0]
+        cure = "list its nodes counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
+        raise ValueError(
+            f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
+            f" ({bad.size} such triangles)"
+        )

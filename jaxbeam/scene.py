@@ -1,0 +1,243 @@
+"""A scene: a mesh, what is fixed, and the terms whose energies are summed.
+
+A scene is data, a pytree whose leaves are floats: JAX traces, maps and differentiates through it, and a
+design is an ordinary function `theta -> Scene`. Units are the user's: forces come out in the unit of
+Young's modulus x length (thickness is 1), energies in force x length.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxbeam._tree import index_field, is_concrete, pytree, read_only, replace
+from jaxbeam.materials import lame, macklin_mueller
+from jaxbeam.mesh import Diagonals, Mesh, rectangle
+from jaxbeam.terms import (
+    SolidEnergy,
+    TendonEnergy,
+    Term,
+    admissible_step,
+    check_nodes,
+    inverse_square_stiffness,
+    solid,
+    tendons,
+    volume_ratios,
+)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """What is simulated.
+
+    Args:
+        mesh: the body at rest, with `n` nodes.
+        terms: the energies that are summed; one that is absent is never traced.
+        fixed: `(n, 2)` booleans, true for a coordinate that does not move (see `clamped`). It is
+            eliminated from the unknowns.
+        tip: `(q,)` node numbers of the end section that the tip measures follow; may be empty.
+
+    Raises:
+        ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, or a term's node is out
+            of range.
+    """
+
+    mesh: Mesh
+    terms: tuple[Term, ...]
+    fixed: np.ndarray = index_field()
+    tip: np.ndarray = index_field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        shape = self.mesh.nodes.shape
+        fixed = np.asarray(self.fixed)
+        if fixed.shape != shape or fixed.dtype != bool:
+            raise ValueError(
+                f"fixed: expected booleans of shape {shape}, got shape {fixed.shape} of dtype {fixed.dtype}; "
+                f"make them with clamped(mesh, nodes)"
+            )
+        if fixed.all():
+            raise ValueError("fixed: every coordinate is fixed, nothing is left to solve for")
+        if not isinstance(self.terms, tuple) or not self.terms or not all(isinstance(t, Term) for t in self.terms):
+            raise ValueError(f"terms: expected a tuple of at least one Term, got {self.terms!r}")
+        for number, term in enumerate(self.terms):
+            check_nodes(f"terms[{number}].nodes", self.mesh, term.nodes, ndim=2)
+        tip = np.asarray(self.tip)
+        if tip.size:
+            tip = check_nodes("tip", self.mesh, tip, ndim=1)
+        object.__setattr__(self, "fixed", read_only(fixed))
+        object.__setattr__(self, "tip", read_only(tip, np.int32))
+
+
+def clamped(mesh: Mesh, nodes: ArrayLike) -> np.ndarray:
+    """`(n, 2)` booleans that fix both coordinates of `nodes` `(m,)`."""
+    fixed = np.zeros(mesh.nodes.shape, bool)
+    fixed[check_nodes("nodes", mesh, nodes, ndim=1)] = True
+    return fixed
+
+
+def tendon_beam(
+    nx: int = 29,
+    ny: int = 7,
+    length: ArrayLike = 3.5,
+    height: ArrayLike = 0.8,
+    young: ArrayLike = 1e4,
+    poisson: ArrayLike = 0.45,
+    tendon_modulus: ArrayLike = 2e3,
+    *,
+    diagonals: Diagonals = "one-sided",
+    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    dtype: Any = None,
+) -> Scene:
+    """The reference scene: a cantilever clamped at its left edge, with a tendon along half of each side.
+
+    The first tendon joins the top-left and the top-middle node, the second the bottom-left and the
+    bottom-middle node. Both are at their natural length, half the beam's.
+
+    Args:
+        nx, ny: nodes along length and height; `nx` odd, so that a middle node exists.
+        length, height: of the beam, positive.
+        young, poisson: scalar or one for each triangle; turned into Lame parameters by `lame`.
+        tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
+        diagonals: see `rectangle`.
+        density: the material, see `jaxbeam.materials`.
+        stiffness: the law of the tendons, see `tendons`.
+        dtype: of everything computed; by default JAX's float.
+
+    Returns:
+        A `Scene`, differentiable in every real argument.
+
+    Raises:
+        ValueError: if `nx` is even, or as `rectangle`, `lame` and `tendons` do.
+    """
+    mesh = rectangle(length, height, nx, ny, diagonals, dtype)
+    if nx % 2 == 0:
+        raise ValueError(
+            f"nx: expected an odd number, got {nx}: no node lies in the middle, where the tendons end; "
+            f"use {nx - 1 if nx > 2 else 3} or {nx + 1}"
+        )
+    bottom_left, top_left = 0, ny - 1
+    bottom_middle = (nx - 1) // 2 * ny
+    body = solid(mesh, lame(young, poisson), density)
+    pair = [[top_left, bottom_middle + ny - 1], [bottom_left, bottom_middle]]
+    left, right = np.arange(ny), (nx - 1) * ny + np.arange(ny)
+    return Scene(mesh, (body, tendons(mesh, pair, tendon_modulus, stiffness)), clamped(mesh, left), right)
+
+
+def command(scene: Scene, ratios: ArrayLike) -> Scene:
+    """The scene with new commanded lengths, `ratio * natural length`.
+
+    Args:
+        scene: with `m` tendons.
+        ratios: `(m,)`, positive, in the order of the tendons; differentiable.
+
+    Raises:
+        ValueError: if the count is wrong or a concrete ratio is not positive and finite.
+    """
+    count = sum(term.nodes.shape[0] for term in tendon_terms(scene))
+    if np.shape(ratios) != (count,):
+        raise ValueError(f"ratios: expected shape ({count},), one for each tendon, got {np.shape(ratios)}")
+    if is_concrete(ratios):
+        array = np.asarray(ratios, float)
+        if not (np.isfinite(array) & (array > 0)).all():
+            raise ValueError(
+                f"ratios: expected positive finite numbers, got {array.tolist()}; 1 is the natural length and "
+                f"0.5 half of it"
+            )
+    values = jnp.asarray(ratios, scene.mesh.nodes.dtype)
+    terms, start = [], 0
+    for term in scene.terms:
+        if isinstance(term.energy, TendonEnergy):
+            stop = start + term.nodes.shape[0]
+            params = replace(term.params, commanded=values[start:stop] * term.params.natural)
+            term, start = replace(term, params=params), stop
+        terms.append(term)
+    return replace(scene, terms=tuple(terms))
+
+
+def tendon_terms(scene: Scene) -> list[Term]:
+    """The terms that are tendons, in order; their tendons are numbered through."""
+    return [term for term in scene.terms if isinstance(term.energy, TendonEnergy)]
+
+
+def solid_terms(scene: Scene) -> list[Term]:
+    """The terms that are solids, in order."""
+    return [term for term in scene.terms if isinstance(term.energy, SolidEnergy)]
+
+
+# ------------------------------------------------------------------------- energy, forces, Hessians
+
+
+class Evaluation(NamedTuple):
+    """Energy `()` and its gradient `(n, 2)`, each with the sum of the magnitudes that were added up in it.
+
+    The second of each pair tells how large its round-off is, and what a relative residual is relative to.
+    """
+
+    energy: jax.Array
+    energy_scale: jax.Array
+    gradient: jax.Array
+    gradient_scale: jax.Array
+
+
+def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
+    """Energy and gradient at node positions `x` `(n, 2)`."""
+    energy = energy_scale = jnp.zeros((), x.dtype)
+    both = jnp.zeros((*x.shape, 2), x.dtype)
+    for term in scene.terms:
+        energies, gradients = jax.vmap(jax.value_and_grad(term.energy))(x[term.nodes], term.params)
+        energy += jnp.sum(energies)
+        energy_scale += jnp.sum(jnp.abs(energies))
+        both = both.at[term.nodes].add(jnp.stack([gradients, jnp.abs(gradients)], axis=-1))
+    return Evaluation(energy, energy_scale, both[..., 0], both[..., 1])
+
+
+def energy(scene: Scene, x: jax.Array) -> jax.Array:
+    """Total energy `()` at node positions `x` `(n, 2)`; differentiable in the scene and in `x`."""
+    return sum((jnp.sum(jax.vmap(t.energy)(x[t.nodes], t.params)) for t in scene.terms), jnp.zeros((), x.dtype))
+
+
+def forces(scene: Scene, x: jax.Array) -> jax.Array:
+    """Force `(n, 2)` of all terms on each node: minus the gradient of the energy."""
+    return -evaluate(scene, x).gradient
+
+
+def reactions(scene: Scene, x: jax.Array) -> jax.Array:
+    """Force `(n, 2)` of the clamp on each node, zero for coordinates that are free.
+
+    At equilibrium the reactions balance every load from outside; the tendons, which push on the body
+    at both ends, are part of the body.
+    """
+    return jnp.where(scene.fixed, -forces(scene, x), 0)
+
+
+def stencil_hessians(scene: Scene, x: jax.Array) -> list[jax.Array]:
+    """For each term, the `(m, k d, k d)` Hessians of its stencils, by autodiff."""
+
+    def hessian(term: Term, positions: jax.Array, params: Any) -> jax.Array:
+        shape = positions.shape
+        return jax.hessian(lambda flat: term.energy(flat.reshape(shape), params))(positions.ravel())
+
+    return [jax.vmap(lambda p, q, t=t: hessian(t, p, q))(x[t.nodes], t.params) for t in scene.terms]
+
+
+def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
+    """Smallest `J = det F` over the solids at `x`; infinite for a scene without one."""
+    ratios = [jnp.min(jax.vmap(volume_ratios)(x[t.nodes], t.params)) for t in solid_terms(scene)]
+    return jnp.min(jnp.stack([jnp.asarray(jnp.inf, x.dtype), *ratios]))
+
+
+def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
+    """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`."""
+    limits = [
+        jnp.min(jax.vmap(admissible_step, in_axes=(0, 0, 0, None))(x[t.nodes], dx[t.nodes], t.params, keep))
+        for t in solid_terms(scene)
+    ]
+    return jnp.min(jnp.stack([jnp.asarray(jnp.inf, x.dtype), *limits]))

@@ -1,0 +1,338 @@
+"""Terms of the energy: one stencil's pure energy, the nodes it acts on, and its parameters.
+
+A `Term` is all the solver knows of physics. Forces, stencil Hessians, their projection, assembly, the
+derivative through equilibrium and the batch axis follow from its three fields. A term's force on the body
+is minus the gradient of its energy; a tendon's tension is positive when it pulls its ends together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxbeam._tree import index_field, is_concrete, pytree, read_only, static_field
+from jaxbeam.materials import macklin_mueller
+from jaxbeam.mesh import Mesh
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Term:
+    """`m` stencils that share one energy.
+
+    Args:
+        energy: pure function `(x, params) -> scalar` of one stencil, `x` `(k, 2)` the positions of its
+            nodes and `params` one stencil's parameters. Make it a module-level function (or a hashable
+            callable): a lambda made anew for every scene would be compiled anew.
+        nodes: `(m, k)` node numbers.
+        params: any pytree of arrays with leading axis `m`. All of it is differentiable. Values that change
+            belong here, never in a closure, or each change compiles again.
+
+    Raises:
+        ValueError: if `nodes` is not a whole-number array of shape `(m, k)`, or an array of `params` has
+            another leading axis.
+    """
+
+    energy: Callable[[jax.Array, Any], jax.Array] = static_field()
+    nodes: np.ndarray = index_field()
+    params: Any
+
+    def __post_init__(self) -> None:
+        if not callable(self.energy):
+            raise ValueError(f"energy: expected a function (x, params) -> scalar, got {self.energy!r}")
+        nodes = np.asarray(self.nodes) if is_concrete(self.nodes) else None
+        if nodes is None or nodes.dtype.kind not in "iu" or nodes.ndim != 2 or 0 in nodes.shape:
+            got = "a traced array" if nodes is None else f"shape {nodes.shape} of dtype {nodes.dtype}"
+            raise ValueError(f"nodes: expected concrete whole numbers of shape (m, k), got {got}")
+        object.__setattr__(self, "nodes", read_only(nodes, np.int32))
+        params = jax.tree.map(jnp.asarray, self.params)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+            if leaf.ndim == 0 or leaf.shape[0] != nodes.shape[0]:
+                raise ValueError(
+                    f"params{jax.tree_util.keystr(path)}: expected leading axis {nodes.shape[0]}, one entry for each "
+                    f"stencil, got shape {leaf.shape}; use jnp.broadcast_to or jnp.full for a shared value"
+                )
+        object.__setattr__(self, "params", params)
+
+
+# ---------------------------------------------------------------------------------------------- solid
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class SolidParams:
+    """Parameters of elements with `k` nodes and `q` quadrature points (leading axis `m` in a `Term`).
+
+    rest `(m, k, 2)`: rest positions. gradients `(m, q, k, 2)`: shape-function gradients in the rest frame.
+    weights `(m, q)`: quadrature weight times rest area. material: pytree with leading axis `m`.
+    """
+
+    rest: jax.Array
+    gradients: jax.Array
+    weights: jax.Array
+    material: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class SolidEnergy:
+    """Energy of one element: the density summed over its quadrature points. Hashable, so never retraced."""
+
+    density: Callable[[jax.Array, Any], jax.Array]
+
+    def __call__(self, x: jax.Array, params: SolidParams) -> jax.Array:
+        densities = jax.vmap(lambda H: self.density(H, params.material))(displacement_gradients(x, params))
+        return jnp.sum(params.weights * densities)
+
+
+def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
+    """`H = F - I` `(q, 2, 2)` of one element at its quadrature points."""
+    return jnp.einsum("ki,qkj->qij", x - params.rest, params.gradients)
+
+
+def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
+    """`J = det F` `(q,)` of one element at its quadrature points."""
+    H = displacement_gradients(x, params)
+    return 1 + H[:, 0, 0] + H[:, 1, 1] + (H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] * H[:, 1, 0])
+
+
+def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: float) -> jax.Array:
+    """Largest `t` for which no point of one element falls below `keep` times its present `J` on `x + t dx`.
+
+    In the plane `J(t) = J + b t + c t^2` with `b = cof F : dH`, `c = det dH`, so the first crossing is the
+    root of a quadratic, taken in the form that does not cancel. Infinite where `J` never falls so far, and
+    where the element is inverted already (then only the energy can judge).
+    """
+    F = displacement_gradients(x, params) + jnp.eye(2, dtype=x.dtype)
+    D = jnp.einsum("ki,qkj->qij", dx, params.gradients)
+    j = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    b = F[:, 1, 1] * D[:, 0, 0] + F[:, 0, 0] * D[:, 1, 1] - F[:, 1, 0] * D[:, 0, 1] - F[:, 0, 1] * D[:, 1, 0]
+    c = D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0]
+    gap = (1 - keep) * j
+    discriminant = b**2 - 4 * c * gap
+    denominator = jnp.sqrt(jnp.maximum(discriminant, 0)) - b
+    crosses = (j > 0) & (discriminant >= 0) & (denominator > 0)
+    return jnp.min(jnp.where(crosses, 2 * gap / jnp.where(crosses, denominator, 1), jnp.inf))
+
+
+def solid(
+    mesh: Mesh,
+    params: Any,
+    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+) -> Term:
+    """The body itself: linear triangles (one quadrature point, exact for a constant gradient).
+
+    Args:
+        mesh: with nodes `(n, 2)`; differentiable in them.
+        params: the density's parameters, such as `lame(young, poisson)`: a pytree whose leaves are scalars
+            or have leading axis `t`, one entry for each triangle. Cast to the dtype of the nodes.
+        density: `(H, params) -> scalar`, one of `jaxbeam.materials` or your own module-level function.
+
+    Raises:
+        ValueError: if a parameter is neither a scalar nor of leading axis `t`.
+    """
+    count, dtype = mesh.elements.shape[0], mesh.nodes.dtype
+
+    def per_element(path: Any, value: ArrayLike) -> jax.Array:
+        array = jnp.asarray(value, dtype)
+        if array.ndim == 0:
+            return jnp.full((count,), array)
+        if array.shape[0] != count:
+            raise ValueError(
+                f"params{jax.tree_util.keystr(path)}: expected a scalar or {count} entries, one for each triangle, "
+                f"got shape {array.shape}"
+            )
+        return array
+
+    material = jax.tree_util.tree_map_with_path(per_element, params)
+    rest = mesh.nodes[mesh.elements]
+    first, second = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
+    twice_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    # Gradients of the barycentric coordinates: rows of the inverse of the edge matrix, and minus their sum.
+    g1 = jnp.stack([second[:, 1], -second[:, 0]], axis=1) / twice_area[:, None]
+    g2 = jnp.stack([-first[:, 1], first[:, 0]], axis=1) / twice_area[:, None]
+    gradients = jnp.stack([-(g1 + g2), g1, g2], axis=1)[:, None]
+    return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, 0.5 * twice_area[:, None], material))
+
+
+# -------------------------------------------------------------------------------------------- tendons
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class TendonParams:
+    """Parameters of tendons (leading axis `m` in a `Term`), all differentiable.
+
+    natural: length at rest (ratio 1). commanded: rest length asked for now, `ratio * natural`.
+    modulus: the coefficient of the tendon's stiffness law.
+    """
+
+    natural: jax.Array
+    commanded: jax.Array
+    modulus: jax.Array
+
+
+def inverse_square_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = modulus / commanded^2`: the reference law. It grows as the tendon is shortened."""
+    return modulus / commanded**2
+
+
+def inverse_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = EA / commanded`: an elastic thread of axial stiffness `EA = modulus`, wound in at its end."""
+    return modulus / commanded
+
+
+def constant_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = modulus`: a spring whose stiffness does not depend on the command."""
+    return modulus
+
+
+@dataclasses.dataclass(frozen=True)
+class TendonEnergy:
+    """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its nodes, `l*` the
+    commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes."""
+
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array]
+
+    def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        stretch = polyline_length(x) - params.commanded
+        return 0.5 * self.stiffness(params.modulus, params.commanded) * stretch**2
+
+    def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        """`dE/dl = k (l - l*)`, positive when it pulls."""
+        return self.stiffness(params.modulus, params.commanded) * (polyline_length(x) - params.commanded)
+
+
+def polyline_length(x: jax.Array) -> jax.Array:
+    """Length of the line through the points `x` `(k, 2)`.
+
+    Where two neighbours meet the length has no derivative; there it and every higher one is zero, not NaN.
+    """
+    squared = jnp.sum((x[1:] - x[:-1]) ** 2, axis=-1)
+    apart = squared > 0
+    return jnp.sum(jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1)), 0))
+
+
+def tendons(
+    mesh: Mesh,
+    nodes: ArrayLike,
+    modulus: ArrayLike,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+) -> Term:
+    """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
+
+    Args:
+        mesh: natural lengths are measured on its rest positions, and differentiable in them.
+        nodes: `(m, k)` node numbers: the two ends of each tendon, with any guides between.
+        modulus: coefficient of the stiffness law, positive; scalar or `(m,)`.
+        stiffness: the law `(modulus, commanded) -> k`, such as `inverse_square_stiffness` (of the reference
+            scene; unit of modulus: force x length), `inverse_stiffness` (force) or `constant_stiffness`
+            (force / length). Tendons of another law are another term.
+
+    Raises:
+        ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
+            nodes, or a concrete modulus is not positive and finite.
+    """
+    lines = check_nodes("nodes", mesh, nodes, ndim=2)
+    if lines.shape[1] < 2:
+        raise ValueError(f"nodes: expected at least two nodes for each tendon, got shape {lines.shape}")
+    ordered = np.sort(lines, axis=1)
+    if (np.diff(ordered, axis=1) == 0).any():
+        k = int(np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))[0])
+        raise ValueError(f"nodes: tendon {k} repeats a node: {lines[k].tolist()}; give each of its points once")
+    if is_concrete(modulus):
+        values = np.asarray(modulus, float)
+        if not (np.isfinite(values) & (values > 0)).all():
+            raise ValueError(f"modulus: expected positive finite numbers, got {modulus!r}")
+    if np.shape(modulus) not in ((), (lines.shape[0],)):
+        raise ValueError(f"modulus: expected a scalar or {lines.shape[0]} entries, got shape {np.shape(modulus)}")
+    natural = jax.vmap(polyline_length)(mesh.nodes[lines])
+    moduli = jnp.broadcast_to(jnp.asarray(modulus, mesh.nodes.dtype), natural.shape)
+    return Term(TendonEnergy(stiffness), lines, TendonParams(natural, natural, moduli))
+
+
+# ---------------------------------------------------------------------------------- loads and springs
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class PointParams:
+    """Rest position `(m, 2)` and a vector or scalar `value` for each loaded node."""
+
+    rest: jax.Array
+    value: jax.Array
+
+
+def dead_load_energy(x: jax.Array, params: PointParams) -> jax.Array:
+    """`-f . (x - X)`: a force of constant size and direction on one node."""
+    return -jnp.sum(params.value * (x[0] - params.rest))
+
+
+def penalty_energy(x: jax.Array, params: PointParams) -> jax.Array:
+    """`1/2 k |x - X|^2`: a spring from one node to its rest position."""
+    return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
+
+
+def dead_load(mesh: Mesh, nodes: ArrayLike, force: ArrayLike) -> Term:
+    """Constant forces on nodes.
+
+    Args:
+        mesh: its rest positions are the zero of the load's energy.
+        nodes: `(m,)` node numbers.
+        force: `(2,)` on each of them, or `(m, 2)`; differentiable.
+
+    Raises:
+        ValueError: if a node is out of range or `force` has another shape or is not finite.
+    """
+    where = check_nodes("nodes", mesh, nodes, ndim=1)
+    if np.shape(force) not in ((2,), (where.size, 2)):
+        raise ValueError(f"force: expected shape (2,) or ({where.size}, 2), got {np.shape(force)}")
+    if is_concrete(force) and not np.isfinite(np.asarray(force)).all():
+        raise ValueError(f"force: expected finite numbers, got {force!r}")
+    values = jnp.broadcast_to(jnp.asarray(force, mesh.nodes.dtype), (where.size, 2))
+    return Term(dead_load_energy, where[:, None], PointParams(mesh.nodes[where], values))
+
+
+def penalty_springs(mesh: Mesh, nodes: ArrayLike, stiffness: ArrayLike) -> Term:
+    """Springs that hold nodes near their rest positions: a soft clamp.
+
+    A clamp in `Scene.fixed` is exact and cheaper. This one, at the usual 1e9, shifts the reference angle
+    by 2e-6 degrees and rules out float32; it is here for comparison with codes that clamp so.
+
+    Args:
+        mesh: gives the rest positions.
+        nodes: `(m,)` node numbers.
+        stiffness: force per length, not negative; scalar or `(m,)`; differentiable.
+
+    Raises:
+        ValueError: if a node is out of range, or `stiffness` has another shape or is negative or not finite.
+    """
+    where = check_nodes("nodes", mesh, nodes, ndim=1)
+    if np.shape(stiffness) not in ((), (where.size,)):
+        raise ValueError(f"stiffness: expected a scalar or {where.size} entries, got shape {np.shape(stiffness)}")
+    if is_concrete(stiffness):
+        array = np.asarray(stiffness, float)
+        if not (np.isfinite(array) & (array >= 0)).all():
+            raise ValueError(f"stiffness: expected finite numbers of at least 0, got {stiffness!r}")
+    values = jnp.broadcast_to(jnp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
+    return Term(penalty_energy, where[:, None], PointParams(mesh.nodes[where], values))
+
+
+def check_nodes(name: str, mesh: Mesh, nodes: ArrayLike, ndim: int) -> np.ndarray:
+    """`nodes` as a concrete array of valid node numbers with `ndim` axes, or a `ValueError` that names it."""
+    if not is_concrete(nodes):
+        raise ValueError(f"{name}: expected concrete node numbers, got a traced array")
+    array = np.asarray(nodes)
+    if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
+        shape = "(m,)" if ndim == 1 else "(m, k)"
+        raise ValueError(f"{name}: expected whole numbers of shape {shape}, got shape {array.shape} of {array.dtype}")
+    count = mesh.nodes.shape[0]
+    outside = array[(array < 0) | (array >= count)]
+    if outside.size:
+        raise ValueError(f"{name}: {outside[0]} is out of range, nodes are numbered 0 to {count - 1}")
+    return array
