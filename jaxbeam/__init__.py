@@ -1,9 +1,10 @@
 """jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
 
-Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> measures. Pictures are in `jaxbeam.plot`,
-which is imported by itself because it needs matplotlib.
+Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> measures. Pictures are in
+`jaxbeam.plot`, which is imported by itself because it needs matplotlib.
 """
 
+from jaxbeam.actuation import commands as commands
 from jaxbeam.actuation import ramp as ramp
 from jaxbeam.actuation import sweep as sweep
 from jaxbeam.equilibrium import EquilibriumError as EquilibriumError

@@ -16,13 +16,19 @@ placeholders. Here unflattening bypasses it, so a constructor can validate what 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 T = TypeVar("T")
+
+# What users may pass for an array: JAX or NumPy arrays, numbers, or (nested) lists of numbers.
+Numbers: TypeAlias = ArrayLike | Sequence[Any]
 
 
 def index_field(**kwargs: Any) -> Any:
@@ -58,15 +64,17 @@ class Key:
         )
 
 
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(index_field, static_field))
 def pytree(cls: type[T]) -> type[T]:
-    """Register a frozen dataclass as a pytree node by the rules of this module."""
+    """Make a class a frozen dataclass and a pytree node by the rules of this module."""
+    dataclasses.dataclass(frozen=True, eq=False)(cls)
     names: dict[str, list[str]] = {"data": [], "index": [], "static": []}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         names[field.metadata.get("kind", "data")].append(field.name)
 
     def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], Any]:
         children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in names["data"]]
-        keys = []
+        keys: list[Key | None] = []
         for name in names["index"]:
             value = getattr(self, name)
             if isinstance(value, np.ndarray):
@@ -106,7 +114,7 @@ def _key(owner: Any, name: str, array: np.ndarray) -> Key:
 def unlock(tree: T) -> T:
     """The same tree with every index array a leaf, so that a jitted function is traced once per shape."""
     if isinstance(tree, tuple | list):
-        return type(tree)(unlock(item) for item in tree)  # type: ignore[return-value]
+        return type(tree)(unlock(item) for item in tree)
     if not dataclasses.is_dataclass(tree):
         return tree
     new = object.__new__(type(tree))
@@ -129,7 +137,7 @@ def replace(tree: T, **changes: Any) -> T:
 
 def is_concrete(*values: Any) -> bool:
     """True if no value is a tracer, so that checks on numbers can run on the host."""
-    return not any(isinstance(value, jax.core.Tracer) for value in values)
+    return not any(isinstance(value, Tracer) for value in values)
 
 
 def read_only(values: Any, dtype: Any = None) -> np.ndarray:

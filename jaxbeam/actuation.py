@@ -9,15 +9,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import is_concrete, unlock
+from jaxbeam._tree import Numbers, is_concrete, unlock
 from jaxbeam.equilibrium import Newton, Solution, newton, report, topology
 from jaxbeam.linear import Layout, expand, gather
 from jaxbeam.scene import Scene, command, evaluate, largest_step
 
 
-def ramp(scene: Scene, ratios: ArrayLike, steps: int = 28, solver: Newton = Newton()) -> Solution:
+def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
+    """The commands `(steps, m)` of a ramp: evenly spaced from ratio 1 to `ratios` `(m,)`.
+
+    Raises:
+        ValueError: if `steps` is not a whole number of at least 2.
+
+    >>> [float(r) for r in commands([0.5], steps=3)[:, 0]]
+    [1.0, 0.75, 0.5]
+    """
+    if not isinstance(steps, int | np.integer) or steps < 2:
+        raise ValueError(f"steps: expected a whole number of at least 2, got {steps!r}")
+    end = jnp.asarray(ratios)
+    end = end if end.dtype.kind == "f" else end.astype(float)
+    way = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)[:, None]
+    # Weighted, not 1 + way * (end - 1), so that the last command is `ratios` to the last bit.
+    return (1 - way) + way * end
+
+
+def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
     """Equilibria on the way from ratio 1 to `ratios`, each started from the one before.
 
     What a beam does when its tendons are pulled slowly: where an equilibrium depends on the path, this is
@@ -27,7 +44,7 @@ def ramp(scene: Scene, ratios: ArrayLike, steps: int = 28, solver: Newton = Newt
     Args:
         scene: with `m` tendons.
         ratios: `(m,)` at the end, positive.
-        steps: commands on the way, evenly spaced, the first at ratio 1 and the last at `ratios`; at least 2.
+        steps: how many commands to solve, `commands(ratios, steps)`: the first at ratio 1; at least 2.
         solver: settings of each solve.
 
     Returns:
@@ -36,17 +53,14 @@ def ramp(scene: Scene, ratios: ArrayLike, steps: int = 28, solver: Newton = Newt
     Raises:
         ValueError: as `command` does, or if `steps` is not a whole number of at least 2.
     """
-    if not isinstance(steps, int | np.integer) or steps < 2:
-        raise ValueError(f"steps: expected a whole number of at least 2, got {steps!r}")
     command(scene, ratios)  # checks the ratios
-    end = jnp.asarray(ratios, scene.mesh.nodes.dtype)
-    way = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)[:, None]
+    way = commands(jnp.asarray(ratios, scene.mesh.nodes.dtype), steps)
     layout = solver.linear.layout(topology(scene))
-    return _ramp(unlock(scene), layout, scene.mesh.nodes, 1 + way * (end - 1), solver)
+    return _ramp(unlock(scene), layout, scene.mesh.nodes, way, solver)
 
 
 @partial(jax.jit, static_argnames="solver")
-def _ramp(scene: Scene, layout: Layout, x: jax.Array, commands: jax.Array, solver: Newton) -> Solution:
+def _ramp(scene: Scene, layout: Layout, x: jax.Array, way: jax.Array, solver: Newton) -> Solution:
     storage = jax.ShapeDtypeStruct(layout.empty.shape, x.dtype)
     factor, _ = jax.eval_shape(solver.linear.factor, layout, storage)
     factor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), factor)
@@ -58,12 +72,10 @@ def _ramp(scene: Scene, layout: Layout, x: jax.Array, commands: jax.Array, solve
         solution = report(scene_now, state, solver)
         return (state.x, state.factor, solution.status == 0), solution
 
-    return lax.scan(advance, (x, factor, jnp.asarray(False)), commands)[1]
+    return lax.scan(advance, (x, factor, jnp.asarray(False)), way)[1]
 
 
-def predict(
-    scene: Scene, layout: Layout, x: jax.Array, factor: Any, usable: jax.Array, solver: Newton
-) -> jax.Array:
+def predict(scene: Scene, layout: Layout, x: jax.Array, factor: Any, usable: jax.Array, solver: Newton) -> jax.Array:
     """Start for a new command, from the equilibrium `x` of the last one and the factor of its Hessian.
 
     The forces that the new command leaves unbalanced at `x` are its force increment, so this is the
@@ -75,7 +87,7 @@ def predict(
     return jnp.where(usable, x + length * step, x)
 
 
-def sweep(scene: Scene, ratios: ArrayLike, solver: Newton = Newton()) -> Solution:
+def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
     """The equilibrium of each of many commands, each solved from rest.
 
     Args:
@@ -98,14 +110,14 @@ def sweep(scene: Scene, ratios: ArrayLike, solver: Newton = Newton()) -> Solutio
         if bad.size:
             raise ValueError(f"ratios: expected positive finite numbers, got {array[bad[0]].tolist()} in row {bad[0]}")
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
-    commands = jnp.asarray(ratios, scene.mesh.nodes.dtype)
-    return _sweep(unlock(scene), solver.linear.layout(topology(scene)), commands, solver)
+    rows = jnp.asarray(ratios, scene.mesh.nodes.dtype)
+    return _sweep(unlock(scene), solver.linear.layout(topology(scene)), rows, solver)
 
 
 @partial(jax.jit, static_argnames="solver")
-def _sweep(scene: Scene, layout: Layout, commands: jax.Array, solver: Newton) -> Solution:
+def _sweep(scene: Scene, layout: Layout, rows: jax.Array, solver: Newton) -> Solution:
     def solve(ratios: jax.Array) -> Solution:
         scene_now = command(scene, ratios)
         return report(scene_now, newton(scene_now, layout, scene.mesh.nodes, solver), solver)
 
-    return lax.map(solve, commands)
+    return lax.map(solve, rows)

@@ -21,9 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import Key, is_concrete, pytree, unlock
+from jaxbeam._tree import Key, Numbers, is_concrete, pytree, unlock
 from jaxbeam.linear import BlockTridiagonal, Layout, LinearSolver, Topology, assemble, expand, gather
 from jaxbeam.linear import project_semidefinite as project
 from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, smallest_jacobian, stencil_hessians
@@ -56,7 +55,6 @@ class EquilibriumError(RuntimeError):
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Solution:
     """An equilibrium and how far to trust it. `ramp` and `sweep` return one with a leading axis.
 
@@ -123,7 +121,7 @@ ROUND_OFF = 4.0
 MAX_SHIFTS = 16
 
 
-def equilibrium(scene: Scene, x0: ArrayLike | None = None, solver: Newton = Newton()) -> Solution:
+def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton()) -> Solution:
     """Node positions at which all forces balance, found by Newton's method from `x0`.
 
     Args:
@@ -165,7 +163,7 @@ def check(solution: Solution) -> Solution:
         if status.ndim:
             shown = ", ".join(str(m) for m in members[:8]) + (", ..." if members.size > 8 else "")
             where = f" in {members.size} of {status.size} members ({shown}); the first of them:"
-        value = lambda field, k=worst: np.asarray(field).ravel()[k]  # noqa: E731
+        value = lambda field, k=worst: np.asarray(field).ravel()[k]
         lines.append(
             f"{flag.name}{where} residual {value(solution.residual):.3g} (tolerance {value(solution.tolerance):.3g}), "
             f"{value(solution.steps)} steps, smallest J {value(solution.smallest_jacobian):.3g}. {REMEDIES[flag]}."
@@ -178,7 +176,7 @@ def topology(scene: Scene) -> Topology:
     return Topology(Key(scene.mesh.elements), Key(scene.fixed), tuple(Key(term.nodes) for term in scene.terms))
 
 
-def start(scene: Scene, x0: ArrayLike | None) -> jax.Array:
+def start(scene: Scene, x0: Numbers | None) -> jax.Array:
     """`x0` `(n, 2)` in the scene's dtype, with fixed coordinates at rest."""
     rest = scene.mesh.nodes
     if x0 is None:
@@ -273,8 +271,10 @@ def convexify(
     stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
 
     def attempt(carry: Any) -> Any:
-        tries, _, _ = carry
-        convex = assemble(layout, [project(h) for h in hessians])
+        # Tied to the loop's counter: XLA moves what does not change out of a loop, and the projection
+        # would be computed in every Newton step, needed or not.
+        tries, stencils = lax.optimization_barrier((carry[0], hessians))
+        convex = assemble(layout, [project(h) for h in stencils])
         shift = jnp.where(tries > 0, stiffness * 10.0 ** (tries - 10), 0).astype(storage.dtype)
         factor, done = solver.linear.factor(layout, convex.at[layout.diagonal].add(shift))
         return tries + 1, factor, done
@@ -314,7 +314,7 @@ def line_search(
     carry = (jnp.zeros((), jnp.int32), state.x, state.at, ~wanted)
     count, x, at, accepted = lax.while_loop(lambda c: ~c[3] & (c[0] <= MAX_HALVINGS), trial, carry)
     moved = wanted & accepted
-    keep = lambda new, old: jnp.where(moved, new, old)  # noqa: E731
+    keep = lambda new, old: jnp.where(moved, new, old)
     return keep(x, state.x), jax.tree.map(keep, at, state.at), jnp.maximum(count - 1, 0), moved
 
 

@@ -40,7 +40,6 @@ def project_semidefinite(hessians: jax.Array) -> jax.Array:
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Layout:
     """Where unknowns and matrix entries are stored, for one topology.
 
@@ -130,7 +129,9 @@ def _dense_layout(topology: Topology) -> Layout:
         rows, columns = _stencil_pairs(position[_coordinates(stencil.array, topology)])
         keep = (rows < size) & (columns < size)
         scatter.append(np.where(keep, rows * size + columns, size * size))
-    return _device_layout(slots, position, scatter, np.arange(size) * (size + 1), np.zeros(size * size, bool), (1, size, 0))
+    return _device_layout(
+        slots, position, scatter, np.arange(size) * (size + 1), np.zeros(size * size, bool), (1, size, 0)
+    )
 
 
 # --------------------------------------------------------------------------------- block tridiagonal
@@ -211,7 +212,7 @@ class BlockTridiagonal:
 def _bordered_layout(topology: Topology) -> Layout:
     fixed = topology.fixed.array
     count, d = fixed.shape
-    free = ~fixed.all(axis=1)
+    free = np.logical_not(fixed.all(axis=1))
     block = _blocks(topology)
     border_nodes = _border(topology, block)
     on_border = np.zeros(count, bool)
@@ -267,7 +268,7 @@ def _blocks(topology: Topology) -> np.ndarray:
     fixed = topology.fixed.array
     neighbours = _adjacency(fixed.shape[0], topology.elements.array)
     weight = (~fixed).sum(axis=1)
-    roots = []
+    roots: list[np.ndarray] = []
     held = np.flatnonzero(fixed.any(axis=1))
     if held.size:
         pieces = _components(held, neighbours)
@@ -340,7 +341,7 @@ def _components(nodes: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) ->
 
 def _border(topology: Topology, block: np.ndarray) -> np.ndarray:
     """Nodes to eliminate last, so that every stencil keeps to two neighbouring blocks."""
-    free = ~topology.fixed.array.all(axis=1)
+    free = np.logical_not(topology.fixed.array.all(axis=1))
     border: set[int] = set()
     for stencil in topology.stencils:
         nodes = stencil.array
@@ -349,11 +350,9 @@ def _border(topology: Topology, block: np.ndarray) -> np.ndarray:
         for k in np.flatnonzero(high - low > 1):
             members = [n for n in dict.fromkeys(nodes[k].tolist()) if free[n] and n not in border]
             # Keep the pair of blocks that holds most of the stencil; the others go to the border.
-            kept = max(
-                ([n for n in members if first <= block[n] <= first + 1] for first in sorted({block[n] for n in members})),
-                key=len,
-                default=[],
-            )
+            owner = {n: int(block[n]) for n in members}
+            pairs = ([n for n in members if first <= owner[n] <= first + 1] for first in sorted(set(owner.values())))
+            kept = max(pairs, key=len, default=[])
             border.update(set(members) - set(kept))
     return np.array(sorted(border), int)
 
@@ -366,7 +365,7 @@ def _coordinates(stencil: np.ndarray, topology: Topology) -> np.ndarray:
 
 def _stencil_pairs(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Row and column unknown `(m, s^2)` of each entry of stencil Hessians, from their unknowns `(m, s)`."""
-    m, s = unknowns.shape
+    s = unknowns.shape[1]
     return np.repeat(unknowns, s, axis=1), np.tile(unknowns, (1, s))
 
 
@@ -382,7 +381,7 @@ def _device_layout(
         raise ValueError(
             f"mesh: its factor would hold {empty.size} numbers, more than 32-bit indices address; use a coarser mesh"
         )
-    to_device = lambda a: jnp.asarray(a, jnp.int32)  # noqa: E731
+    to_device = lambda a: jnp.asarray(a, jnp.int32)
     # Cached across calls, so it must not be a tracer of the call that made it.
     with jax.ensure_compile_time_eval():
         places = tuple(to_device(s) for s in scatter)

@@ -8,18 +8,14 @@ their digits: `|F|^2 - 2 = 2 tr H + |H|^2`, `J - 1 = tr H + det H`. All are diff
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import is_concrete, pytree
+from jaxbeam._tree import Numbers, is_concrete, pytree
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Lame:
     """Lame parameters: shear modulus `mu` and first parameter `lam`, scalars or one for each element."""
 
@@ -27,7 +23,7 @@ class Lame:
     lam: jax.Array
 
 
-def lame(young: ArrayLike, poisson: ArrayLike) -> Lame:
+def lame(young: Numbers, poisson: Numbers) -> Lame:
     """Lame parameters of linear isotropic elasticity (any textbook, e.g. Bonet and Wood 2008, eq. 6.33).
 
     Args:
@@ -46,7 +42,7 @@ def lame(young: ArrayLike, poisson: ArrayLike) -> Lame:
     return Lame(young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson)))
 
 
-def lame_macklin_mueller(young: ArrayLike, poisson: ArrayLike) -> Lame:
+def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:
     """Parameters that make `macklin_mueller` behave as (young, poisson) at small strain.
 
     Its linearisation has shear modulus `mu` and first parameter `lam - mu`, so `lam` is raised by `mu`.
@@ -101,7 +97,7 @@ def linear_elastic(H: jax.Array, params: Lame) -> jax.Array:
     return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
 
 
-def _check_range(name: str, value: ArrayLike, low: float, high: float, why: str) -> None:
+def _check_range(name: str, value: Numbers, low: float, high: float, why: str) -> None:
     if not is_concrete(value):
         return
     array = np.asarray(value)
@@ -110,4 +106,5 @@ def _check_range(name: str, value: ArrayLike, low: float, high: float, why: str)
     bad = np.flatnonzero(~((array > low) & (array < high)))
     if bad.size:
         where = f" at element {bad[0]}" if array.ndim else ""
-        raise ValueError(f"{name}: expected a value in ({low:g}, {high:g}), got {array.ravel()[bad[0]]!r}{where}; {why}")
+        got = f"{array.ravel()[bad[0]]:g}"
+        raise ValueError(f"{name}: expected a value in ({low:g}, {high:g}), got {got}{where}; {why}")

@@ -6,13 +6,16 @@ Angles are in degrees, everything else in the user's units.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.scene import Scene, solid_terms, tendon_terms
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
-from jaxbeam.terms import TendonEnergy, displacement_gradients, polyline_length
+from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, displacement_gradients, polyline_length
 
 
 def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
@@ -91,17 +94,19 @@ def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
     return _over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))
 
 
-def _stress(H, density, material):  # noqa: ANN001, ANN202
+def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> jax.Array:
     F = H + jnp.eye(2, dtype=H.dtype)
     return jax.grad(density)(H, material) @ F.T / jnp.linalg.det(F)
 
 
-def _over_elements(scene: Scene, x: jax.Array, measure) -> jax.Array:  # noqa: ANN001
-    """A function of `(H, density, material)` on every element of the solids, averaged with the weights."""
+def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
+    """`measure(H, density, material)` on every element of the solids, averaged with the quadrature weights."""
     found = []
     for term in solid_terms(scene):
+        assert isinstance(term.energy, SolidEnergy)
+        density = term.energy.density
 
-        def one(positions, params, density=term.energy.density):  # noqa: ANN001, ANN202
+        def one(positions: jax.Array, params: SolidParams, density: Callable = density) -> jax.Array:
             values = jax.vmap(lambda H: measure(H, density, params.material))(displacement_gradients(positions, params))
             return jnp.tensordot(params.weights / jnp.sum(params.weights), values, axes=1)
 

@@ -6,22 +6,19 @@ once; what follows trusts a `Mesh`.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import index_field, is_concrete, pytree, read_only
+from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Mesh:
     """Nodes and triangles of a body at rest.
 
@@ -58,8 +55,8 @@ class Mesh:
 
 
 def rectangle(
-    length: ArrayLike,
-    height: ArrayLike,
+    length: Numbers,
+    height: Numbers,
     nx: int,
     ny: int,
     diagonals: Diagonals = "one-sided",
@@ -148,7 +145,7 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
     return np.flatnonzero(mask)
 
 
-def nearest_node(mesh: Mesh, point: ArrayLike) -> int:
+def nearest_node(mesh: Mesh, point: Numbers) -> int:
     """Number of the node nearest to `point` `(2,)` at rest (the lowest number among equals).
 
     Raises:
@@ -162,18 +159,22 @@ def nearest_node(mesh: Mesh, point: ArrayLike) -> int:
 
 def _concrete_nodes(mesh: Mesh) -> np.ndarray:
     if not is_concrete(mesh.nodes):
-        raise ValueError("mesh: its nodes are traced, so they cannot be selected by position; select before jit or grad")
+        raise ValueError(
+            "mesh: its nodes are traced, so nodes cannot be selected by position; select before jit or grad"
+        )
     return np.asarray(mesh.nodes, dtype=np.float64)
 
 
 def _checked_elements(elements: Any) -> np.ndarray:
     if not is_concrete(elements):
-        raise ValueError("elements: expected concrete node numbers, got a traced array; build the mesh's topology outside")
+        raise ValueError("elements: expected concrete node numbers, got a traced array; build the topology outside")
     array = np.asarray(elements)
     if array.dtype.kind not in "iu":
         raise ValueError(f"elements: expected whole numbers, got dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise ValueError(f"elements: expected shape (t, 3) with t >= 1, got {array.shape}; give one row for each triangle")
+        raise ValueError(
+            f"elements: expected shape (t, 3) with t >= 1, got {array.shape}; give a row for each triangle"
+        )
     if array.max() >= 2**31:
         raise ValueError(f"elements: node numbers must fit 32 bits, got {array.max()}")
     return read_only(array, np.int32)

@@ -7,16 +7,14 @@ Young's modulus x length (thickness is 1), energies in force x length.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import index_field, is_concrete, pytree, read_only, replace
+from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only, replace
 from jaxbeam.materials import lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, rectangle
 from jaxbeam.terms import (
@@ -33,7 +31,6 @@ from jaxbeam.terms import (
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """What is simulated.
 
@@ -75,7 +72,7 @@ class Scene:
         object.__setattr__(self, "tip", read_only(tip, np.int32))
 
 
-def clamped(mesh: Mesh, nodes: ArrayLike) -> np.ndarray:
+def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
     """`(n, 2)` booleans that fix both coordinates of `nodes` `(m,)`."""
     fixed = np.zeros(mesh.nodes.shape, bool)
     fixed[check_nodes("nodes", mesh, nodes, ndim=1)] = True
@@ -85,11 +82,11 @@ def clamped(mesh: Mesh, nodes: ArrayLike) -> np.ndarray:
 def tendon_beam(
     nx: int = 29,
     ny: int = 7,
-    length: ArrayLike = 3.5,
-    height: ArrayLike = 0.8,
-    young: ArrayLike = 1e4,
-    poisson: ArrayLike = 0.45,
-    tendon_modulus: ArrayLike = 2e3,
+    length: Numbers = 3.5,
+    height: Numbers = 0.8,
+    young: Numbers = 1e4,
+    poisson: Numbers = 0.45,
+    tendon_modulus: Numbers = 2e3,
     *,
     diagonals: Diagonals = "one-sided",
     density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
@@ -102,9 +99,12 @@ def tendon_beam(
     bottom-middle node. Both are at their natural length, half the beam's.
 
     Args:
-        nx, ny: nodes along length and height; `nx` odd, so that a middle node exists.
-        length, height: of the beam, positive.
-        young, poisson: scalar or one for each triangle; turned into Lame parameters by `lame`.
+        nx: nodes along the length, odd, so that a middle node exists.
+        ny: nodes along the height.
+        length: of the beam, positive.
+        height: of the beam, positive.
+        young: Young's modulus, scalar or one for each triangle.
+        poisson: Poisson's ratio, scalar or one for each triangle; `lame` turns both into Lame parameters.
         tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
         diagonals: see `rectangle`.
         density: the material, see `jaxbeam.materials`.
@@ -131,7 +131,7 @@ def tendon_beam(
     return Scene(mesh, (body, tendons(mesh, pair, tendon_modulus, stiffness)), clamped(mesh, left), right)
 
 
-def command(scene: Scene, ratios: ArrayLike) -> Scene:
+def command(scene: Scene, ratios: Numbers) -> Scene:
     """The scene with new commanded lengths, `ratio * natural length`.
 
     Args:

@@ -14,15 +14,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from jaxbeam._tree import index_field, is_concrete, pytree, read_only, static_field
+from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only, static_field
 from jaxbeam.materials import macklin_mueller
 from jaxbeam.mesh import Mesh
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class Term:
     """`m` stencils that share one energy.
 
@@ -65,7 +63,6 @@ class Term:
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class SolidParams:
     """Parameters of elements with `k` nodes and `q` quadrature points (leading axis `m` in a `Term`).
 
@@ -138,7 +135,7 @@ def solid(
     """
     count, dtype = mesh.elements.shape[0], mesh.nodes.dtype
 
-    def per_element(path: Any, value: ArrayLike) -> jax.Array:
+    def per_element(path: Any, value: Numbers) -> jax.Array:
         array = jnp.asarray(value, dtype)
         if array.ndim == 0:
             return jnp.full((count,), array)
@@ -164,7 +161,6 @@ def solid(
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class TendonParams:
     """Parameters of tendons (leading axis `m` in a `Term`), all differentiable.
 
@@ -220,8 +216,8 @@ def polyline_length(x: jax.Array) -> jax.Array:
 
 def tendons(
     mesh: Mesh,
-    nodes: ArrayLike,
-    modulus: ArrayLike,
+    nodes: Numbers,
+    modulus: Numbers,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
 ) -> Term:
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
@@ -260,7 +256,6 @@ def tendons(
 
 
 @pytree
-@dataclasses.dataclass(frozen=True, eq=False)
 class PointParams:
     """Rest position `(m, 2)` and a vector or scalar `value` for each loaded node."""
 
@@ -278,7 +273,7 @@ def penalty_energy(x: jax.Array, params: PointParams) -> jax.Array:
     return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
 
 
-def dead_load(mesh: Mesh, nodes: ArrayLike, force: ArrayLike) -> Term:
+def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     """Constant forces on nodes.
 
     Args:
@@ -298,7 +293,7 @@ def dead_load(mesh: Mesh, nodes: ArrayLike, force: ArrayLike) -> Term:
     return Term(dead_load_energy, where[:, None], PointParams(mesh.nodes[where], values))
 
 
-def penalty_springs(mesh: Mesh, nodes: ArrayLike, stiffness: ArrayLike) -> Term:
+def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
     """Springs that hold nodes near their rest positions: a soft clamp.
 
     A clamp in `Scene.fixed` is exact and cheaper. This one, at the usual 1e9, shifts the reference angle
@@ -323,7 +318,7 @@ def penalty_springs(mesh: Mesh, nodes: ArrayLike, stiffness: ArrayLike) -> Term:
     return Term(penalty_energy, where[:, None], PointParams(mesh.nodes[where], values))
 
 
-def check_nodes(name: str, mesh: Mesh, nodes: ArrayLike, ndim: int) -> np.ndarray:
+def check_nodes(name: str, mesh: Mesh, nodes: Numbers, ndim: int) -> np.ndarray:
     """`nodes` as a concrete array of valid node numbers with `ndim` axes, or a `ValueError` that names it."""
     if not is_concrete(nodes):
         raise ValueError(f"{name}: expected concrete node numbers, got a traced array")
