@@ -36,7 +36,9 @@ def test_picture_exists():
         assert (Path(__file__).parent.parent / picture).stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("row", re.findall(r"^\| (\d\.\d), (\d\.\d) \| ([+-]\S+) \| (\S+), (\S+) \|$", README, re.MULTILINE))
+@pytest.mark.parametrize(
+    "row", re.findall(r"^\| (\d\.\d), (\d\.\d) \| ([+-]\S+) \| (\S+), (\S+) \|$", README, re.MULTILINE)
+)
 def test_table(row):
     ratios = jnp.array([float(v) for v in row[:2]])
     scene = jb.command(jb.tendon_beam(), ratios)

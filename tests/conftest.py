@@ -1,0 +1,39 @@
+"""Settings and scenes that the tests share. Each new scene shape compiles for seconds, so few shapes are used."""
+
+import jax
+import pytest
+
+import jaxbeam as jb
+
+jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="session")
+def beam():
+    """The reference scene, at its natural lengths."""
+    return jb.tendon_beam()
+
+
+@pytest.fixture(scope="session")
+def mirrored():
+    """The reference scene on a mesh that is symmetric about mid-height; same shape as `beam`."""
+    return jb.tendon_beam(diagonals="mirrored")
+
+
+@pytest.fixture(scope="session")
+def steered(beam):
+    """The reference scene commanded to (0.4, 1.0), and its equilibrium by one jump from rest."""
+    scene = jb.command(beam, [0.4, 1.0])
+    return scene, jb.equilibrium(scene)
+
+
+@pytest.fixture(scope="session")
+def bent_path(beam):
+    """The reference ramp of 28 steps to (0.4, 1.0)."""
+    return jb.ramp(beam, [0.4, 1.0], steps=28)
+
+
+@pytest.fixture(scope="session")
+def folded_path(beam):
+    """The reference ramp of 28 steps with both tendons to 0.4, which passes a fold."""
+    return jb.ramp(beam, [0.4, 0.4], steps=28)

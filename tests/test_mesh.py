@@ -1,0 +1,197 @@
+"""Meshes: patterns, selection, what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import EPS, areas, disturbed, l_shape, shuffled, total_area
+
+import jaxbeam as jb
+
+PATTERNS = ["one-sided", "mirrored", "crossed"]
+SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+HALVES = [[0, 1, 2], [0, 2, 3]]
+
+
+def triangle_set(nodes, elements):
+    """The triangles as a set of sets of points, to compare meshes whatever their numbering."""
+    points = np.round(np.asarray(nodes), 9) + 0.0  # + 0.0 turns -0 into 0
+    return {frozenset(map(tuple, points[e])) for e in elements}
+
+
+@pytest.mark.parametrize("diagonals", PATTERNS)
+@pytest.mark.parametrize(("nx", "ny"), [(2, 3), (5, 3), (4, 5)])
+def test_rectangle_covers_its_area(diagonals, nx, ny):
+    mesh = jb.rectangle(3.0, 0.7, nx, ny, diagonals=diagonals)
+    cells = (nx - 1) * (ny - 1)
+    crossed = diagonals == "crossed"
+    assert mesh.nodes.shape == (nx * ny + crossed * cells, 2)
+    assert mesh.elements.shape == (cells * (4 if crossed else 2), 3)
+    # All areas equal and positive, and their sum right: no overlap, no gap. Round-off of a sum.
+    np.testing.assert_allclose(areas(mesh), 3.0 * 0.7 / len(mesh.elements), rtol=1e3 * EPS)
+    corners = np.array([[-1.5, -0.35], [1.5, 0.35]])
+    np.testing.assert_array_equal([mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)], corners)
+
+
+def test_reference_mesh_is_the_stated_one():
+    mesh = jb.rectangle(3.5, 0.8, 29, 7)
+    assert mesh.nodes.shape == (203, 2)
+    assert mesh.elements.shape == (336, 3)
+    # Numbered along the short side.
+    np.testing.assert_allclose(mesh.nodes[7 * 3 + 2], [-1.75 + 3 * 0.125, -0.4 + 2 * 0.8 / 6], atol=4 * EPS)
+    # The diagonal of the first cell, from lower left (0) to upper right (8), belongs to two triangles.
+    assert sum({0, 8} <= set(e) for e in mesh.elements.tolist()) == 2
+    assert sum({1, 7} <= set(e) for e in mesh.elements.tolist()) == 0
+
+
+@pytest.mark.parametrize(("diagonals", "symmetric"), [("one-sided", False), ("mirrored", True), ("crossed", True)])
+def test_symmetry_about_mid_height(diagonals, symmetric):
+    mesh = jb.rectangle(2.0, 1.0, 4, 5, diagonals=diagonals)
+    nodes = np.asarray(mesh.nodes)
+    mirror = triangle_set(nodes * [1, -1], mesh.elements)
+    assert (triangle_set(nodes, mesh.elements) == mirror) is symmetric
+
+
+def test_lower_half_of_mirrored_is_one_sided():
+    one, two = (jb.rectangle(2.0, 1.0, 4, 5, diagonals=d) for d in ("one-sided", "mirrored"))
+    lower = [{*e} for e in one.elements.tolist() if all(one.nodes[n, 1] < 1e-9 for n in e)]
+    assert len(lower) == 12
+    assert all(triangle in [{*e} for e in two.elements.tolist()] for triangle in lower)
+
+
+def test_rectangle_differentiates_in_its_extents():
+    area = lambda extent: jnp.sum(jb.rectangle(extent[0], extent[1], 3, 3).nodes ** 2)
+    length, height = 2.0, 1.0
+    # sum of squares is proportional to the square of each extent: x in {-1/2, 0, 1/2} thrice.
+    np.testing.assert_allclose(jax.grad(area)(jnp.array([length, height])), [3 * length, 3 * height], rtol=10 * EPS)
+    np.testing.assert_allclose(jax.jit(area)(jnp.array([length, height])), 1.5 * (length**2 + height**2), rtol=10 * EPS)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "dtype"),
+    [
+        (SQUARE, jnp.float64),
+        ([[0, 0], [1, 0], [1, 1], [0, 1]], jnp.float64),
+        (np.array(SQUARE, np.float32), jnp.float32),
+        (jnp.asarray(SQUARE), jnp.float64),
+        (np.array(SQUARE).astype(int), jnp.float64),
+    ],
+    ids=["list", "whole numbers", "numpy float32", "jax", "numpy int"],
+)
+@pytest.mark.parametrize("elements", [HALVES, np.array(HALVES, np.uint8), jnp.asarray(HALVES)], ids=type)
+def test_accepts(nodes, dtype, elements):
+    mesh = jb.Mesh(nodes, elements)
+    assert isinstance(mesh.nodes, jax.Array)
+    assert mesh.nodes.dtype == dtype
+    assert total_area(mesh) == 1
+    assert not mesh.elements.flags.writeable
+
+
+def test_elements_are_copied():
+    """A caller who changes his array afterwards does not change the mesh, whose layout is cached."""
+    elements = np.array(HALVES)
+    mesh = jb.Mesh(SQUARE, elements)
+    elements[0] = 0
+    assert mesh.elements.tolist() == HALVES
+
+
+def changed(k, value):
+    nodes = np.array(SQUARE)
+    nodes[k] = value
+    return nodes
+
+
+@pytest.mark.parametrize(
+    ("nodes", "elements", "message"),
+    [
+        (np.zeros((4, 3)), HALVES, r"nodes: expected shape \(n, 2\), got \(4, 3\)"),
+        (np.zeros(8), HALVES, r"nodes: expected shape \(n, 2\), got \(8,\)"),
+        (np.array(SQUARE, complex), HALVES, r"nodes: expected real numbers, got dtype complex128"),
+        (np.array(SQUARE, str), HALVES, r"nodes: expected real numbers, got dtype"),
+        (SQUARE, [[0, 1], [2, 3]], r"elements: expected shape \(t, 3\) with t >= 1, got \(2, 2\)"),
+        (SQUARE, np.zeros((0, 3), int), r"elements: expected shape \(t, 3\) with t >= 1, got \(0, 3\)"),
+        (SQUARE, np.array(HALVES, float), r"elements: expected whole numbers, got dtype float64"),
+        (SQUARE, [[0, 1, 2], [0, 2, 4]], r"elements: triangle 1 is \[0, 2, 4\], but nodes are numbered 0 to 3"),
+        (SQUARE, [[0, 1, 2], [0, 2, -1]], r"elements: triangle 1 is \[0, 2, -1\], but nodes are numbered 0 to 3"),
+        (SQUARE, [[0, 1, 2], [0, 2, 2**31]], r"elements: node numbers must fit 32 bits, got 2147483648"),
+        (SQUARE, [[0, 1, 2], [0, 3, 3]], r"elements: triangle 1 repeats a node: \[0, 3, 3\]"),
+        (SQUARE, [*HALVES, [2, 0, 1]], r"elements: triangle 0, \[0, 1, 2\], is listed more than once"),
+        (SQUARE, [[0, 1, 2]], r"nodes: 1 belong to no triangle, the first is node 3; remove"),
+        (changed(2, [np.nan, 0]), HALVES, r"nodes: node 2 is not finite: \[nan, 0.0\]"),
+        (changed(1, [np.inf, 0]), HALVES, r"nodes: node 1 is not finite"),
+        (changed(3, [1, 0]), HALVES, r"nodes: nodes 1 and 3 coincide at \[1.0, 0.0\]; merge"),
+        (SQUARE, [[0, 1, 2], [0, 3, 2]], r"triangle 1, \[0, 3, 2\], has area -0.5, expected positive; .*counter-clock"),
+        (changed(3, [0.5, 0.5]), HALVES, r"triangle 1, \[0, 2, 3\], has area 0, expected positive; remove it"),
+    ],
+)
+def test_refuses(nodes, elements, message):
+    with pytest.raises(ValueError, match=message):
+        jb.Mesh(nodes, elements)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"nx": 1}, r"nx: expected a whole number of at least 2, got 1"),
+        ({"ny": 1}, r"ny: expected a whole number of at least 2, got 1"),
+        ({"nx": 3.0}, r"nx: expected a whole number of at least 2, got 3\.0"),
+        ({"ny": True}, r"ny: expected a whole number of at least 2, got True"),
+        ({"length": 0.0}, r"length: expected a positive finite number, got 0\.0"),
+        ({"length": np.inf}, r"length: expected a positive finite number, got inf"),
+        ({"height": -1.0}, r"height: expected a positive finite number, got -1\.0"),
+        ({"height": np.nan}, r"height: expected a positive finite number, got nan"),
+        ({"height": [1.0, 2.0]}, r"height: expected a positive finite number, got \[1\.0, 2\.0\]"),
+        ({"diagonals": "alternate"}, r"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got 'alternate'"),
+        ({"diagonals": "mirrored", "ny": 4}, r"ny: expected an odd number for mirrored diagonals, got 4.*use 5"),
+    ],
+)
+def test_rectangle_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jb.rectangle(**({"length": 2.0, "height": 1.0, "nx": 3, "ny": 3} | arguments))
+
+
+def test_traced_topology_is_refused():
+    with pytest.raises(ValueError, match="elements: expected concrete node numbers, got a traced array"):
+        jax.jit(lambda elements: jb.Mesh(SQUARE, elements).nodes)(jnp.asarray(HALVES))
+
+
+def test_selection():
+    mesh = jb.rectangle(2.0, 1.0, 3, 2)
+    assert jb.nodes_where(mesh, lambda x, y: y > 0).tolist() == [1, 3, 5]
+    assert jb.nodes_where(mesh, lambda x, y: (x > 0.9) & (y < 0)).tolist() == [4]
+    assert jb.nearest_node(mesh, [0.2, 0.3]) == 3
+    assert jb.nearest_node(mesh, (0, 0)) == 2  # nodes 2 and 3 are equally near: the lower number
+    assert isinstance(jb.nearest_node(mesh, np.zeros(2)), int)
+
+
+@pytest.mark.parametrize("irregular", [disturbed(jb.rectangle(2.0, 1.0, 5, 4)), shuffled(l_shape())[0]])
+def test_nearest_is_nearest(irregular):
+    for point in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
+        chosen = jb.nearest_node(irregular, point)
+        distance = np.hypot(*(np.asarray(irregular.nodes) - point).T)
+        assert distance[chosen] == distance.min()
+
+
+@pytest.mark.parametrize(
+    ("predicate", "message"),
+    [
+        (lambda x, y: x > 5, r"predicate: selects no node; x spans \[-1, 1\], y spans \[-0.5, 0.5\]"),
+        (lambda x, y: x, r"predicate: expected \(6,\) booleans, got shape \(6,\) of dtype float64"),
+        (lambda x, y: True, r"predicate: expected \(6,\) booleans, got shape \(\) of dtype bool"),
+    ],
+)
+def test_selection_refuses(predicate, message):
+    with pytest.raises(ValueError, match=message):
+        jb.nodes_where(jb.rectangle(2.0, 1.0, 3, 2), predicate)
+
+
+@pytest.mark.parametrize("point", [[0.0], [0.0, np.nan], [[0.0, 0.0]], 1.0])
+def test_nearest_refuses(point):
+    with pytest.raises(ValueError, match="point: expected two finite coordinates, got"):
+        jb.nearest_node(jb.rectangle(2.0, 1.0, 3, 2), point)
+
+
+@pytest.mark.parametrize("select", [lambda m: jb.nearest_node(m, [0, 0]), lambda m: jb.nodes_where(m, np.greater)])
+def test_selection_by_traced_positions_is_refused(select):
+    with pytest.raises(ValueError, match="mesh: its nodes are traced"):
+        jax.jit(lambda length: select(jb.rectangle(length, 1.0, 3, 2)))(2.0)
