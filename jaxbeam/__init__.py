@@ -7,8 +7,10 @@ Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuatio
 from jaxbeam.actuation import commands as commands
 from jaxbeam.actuation import ramp as ramp
 from jaxbeam.actuation import sweep as sweep
+from jaxbeam.branch import Branch as Branch
+from jaxbeam.branch import Critical as Critical
+from jaxbeam.branch import trace_branch as trace_branch
 from jaxbeam.equilibrium import EquilibriumError as EquilibriumError
-from jaxbeam.equilibrium import Newton as Newton
 from jaxbeam.equilibrium import Solution as Solution
 from jaxbeam.equilibrium import Status as Status
 from jaxbeam.equilibrium import check as check
@@ -34,6 +36,7 @@ from jaxbeam.mesh import Mesh as Mesh
 from jaxbeam.mesh import nearest_node as nearest_node
 from jaxbeam.mesh import nodes_where as nodes_where
 from jaxbeam.mesh import rectangle as rectangle
+from jaxbeam.newton import Newton as Newton
 from jaxbeam.scene import Scene as Scene
 from jaxbeam.scene import clamped as clamped
 from jaxbeam.scene import command as command
@@ -42,6 +45,8 @@ from jaxbeam.scene import forces as forces
 from jaxbeam.scene import reactions as reactions
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
 from jaxbeam.scene import tendon_beam as tendon_beam
+from jaxbeam.stability import Modes as Modes
+from jaxbeam.stability import lowest_mode as lowest_mode
 from jaxbeam.terms import Term as Term
 from jaxbeam.terms import constant_stiffness as constant_stiffness
 from jaxbeam.terms import dead_load as dead_load

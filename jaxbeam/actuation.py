@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +10,11 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Numbers, is_concrete, unlock
-from jaxbeam.equilibrium import Newton, Solution, newton, report, topology
-from jaxbeam.linear import Layout, expand, gather
-from jaxbeam.scene import Scene, command, evaluate, largest_step
+from jaxbeam.equilibrium import Solution, _equilibrium, follow
+from jaxbeam.held import check_held
+from jaxbeam.linear import Layout
+from jaxbeam.newton import Newton, topology
+from jaxbeam.scene import Scene, command
 
 
 def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
@@ -51,40 +52,18 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
         A `Solution` with leading axis `steps`; each step has its own status.
 
     Raises:
-        ValueError: as `command` does, or if `steps` is not a whole number of at least 2.
+        ValueError: as `command` and `equilibrium` do, or if `steps` is not a whole number of at least 2.
     """
+    check_held(scene)
     command(scene, ratios)  # checks the ratios
-    way = commands(jnp.asarray(ratios, scene.mesh.nodes.dtype), steps)
-    layout = solver.linear.layout(topology(scene))
-    return _ramp(unlock(scene), layout, scene.mesh.nodes, way, solver)
+    end = commands(jnp.asarray(ratios, scene.mesh.nodes.dtype), steps)[-1]
+    return _ramp(unlock(scene), solver.linear.layout(topology(scene)), end, steps, solver)
 
 
-@partial(jax.jit, static_argnames="solver")
-def _ramp(scene: Scene, layout: Layout, x: jax.Array, way: jax.Array, solver: Newton) -> Solution:
-    storage = jax.ShapeDtypeStruct(layout.empty.shape, x.dtype)
-    factor, _ = jax.eval_shape(solver.linear.factor, layout, storage)
-    factor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), factor)
-
-    def advance(carry: Any, ratios: jax.Array) -> Any:
-        x, factor, usable = carry
-        scene_now = command(scene, ratios)
-        state = newton(scene_now, layout, predict(scene_now, layout, x, factor, usable, solver), solver)
-        solution = report(scene_now, state, solver)
-        return (state.x, state.factor, solution.status == 0), solution
-
-    return lax.scan(advance, (x, factor, jnp.asarray(False)), way)[1]
-
-
-def predict(scene: Scene, layout: Layout, x: jax.Array, factor: Any, usable: jax.Array, solver: Newton) -> jax.Array:
-    """Start for a new command, from the equilibrium `x` of the last one and the factor of its Hessian.
-
-    The forces that the new command leaves unbalanced at `x` are its force increment, so this is the
-    tangent predictor with the increment taken exactly. Shortened where an element would invert.
-    """
-    step = expand(layout, -solver.linear.solve(layout, factor, gather(layout, evaluate(scene, x).gradient)), x.shape)
-    length = jnp.minimum(1.0, largest_step(scene, x, step, solver.keep_volume)).astype(x.dtype)
-    usable = usable & jnp.all(jnp.isfinite(step))
-    return jnp.where(usable, x + length * step, x)
+@partial(jax.jit, static_argnames=("steps", "solver"))
+def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
+    targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
+    return follow(lambda s: command(scene, (1 - s) + s * end), layout, scene.mesh.nodes, targets, solver)
 
 
 def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
@@ -99,7 +78,7 @@ def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
         A `Solution` with leading axis `B`.
 
     Raises:
-        ValueError: if the shape is wrong, or a concrete ratio is not positive and finite.
+        ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
     """
     shape = np.shape(ratios)
     if len(shape) != 2 or shape[0] == 0:
@@ -109,6 +88,7 @@ def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
         bad = np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1))
         if bad.size:
             raise ValueError(f"ratios: expected positive finite numbers, got {array[bad[0]].tolist()} in row {bad[0]}")
+    check_held(scene)
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
     rows = jnp.asarray(ratios, scene.mesh.nodes.dtype)
     return _sweep(unlock(scene), solver.linear.layout(topology(scene)), rows, solver)
@@ -116,8 +96,4 @@ def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
 
 @partial(jax.jit, static_argnames="solver")
 def _sweep(scene: Scene, layout: Layout, rows: jax.Array, solver: Newton) -> Solution:
-    def solve(ratios: jax.Array) -> Solution:
-        scene_now = command(scene, ratios)
-        return report(scene_now, newton(scene_now, layout, scene.mesh.nodes, solver), solver)
-
-    return lax.map(solve, rows)
+    return lax.map(lambda ratios: _equilibrium(command(scene, ratios), layout, scene.mesh.nodes, solver), rows)

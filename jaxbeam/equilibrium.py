@@ -1,19 +1,14 @@
-"""Quasistatic equilibrium by Newton's method, and what is said of the answer.
+"""Quasistatic equilibrium: what is asked, what is answered, and how far the answer can be trusted.
 
-At equilibrium the gradient of the energy vanishes at every free coordinate. A Newton step takes the true
-Hessian whenever its Cholesky factor exists, and the one projected element by element only where it does
-not: always projecting would make convergence linear. At the solution the true factor exists if and only if the
-equilibrium is stable.
-
-The residual is relative: the largest unbalanced force on a free coordinate over the *force scale*, the
-largest sum of the magnitudes of the stencil forces that meet at one coordinate. So a change of units
-changes nothing. Forces smaller than round-off can tell apart count as balanced: see `force_scale`.
+At equilibrium the gradient of the energy vanishes at every free coordinate. It is stable if the Hessian
+there is positive definite. One Newton solve (`jaxbeam.newton`) is an attempt; `follow` makes as many as it
+takes to get along a path of scenes, and a single equilibrium is the shortest of paths.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import enum
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,10 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Key, Numbers, is_concrete, pytree, unlock
-from jaxbeam.linear import BlockTridiagonal, Layout, LinearSolver, Topology, assemble, expand, gather
-from jaxbeam.linear import project_semidefinite as project
-from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, smallest_jacobian, stencil_hessians
+from jaxbeam._tree import Numbers, is_concrete, pytree, replace, unlock
+from jaxbeam.held import check_held
+from jaxbeam.linear import Layout, expand, gather
+from jaxbeam.newton import Newton, State, newton, no_factor, topology
+from jaxbeam.scene import (
+    Evaluation,
+    Scene,
+    evaluate,
+    is_valid,
+    largest_step,
+    partway,
+    ratios_of,
+    worst_element,
+)
 
 
 class Status(enum.IntFlag):
@@ -36,17 +41,23 @@ class Status(enum.IntFlag):
     NONFINITE = 2
     INVERTED = 4
     UNSTABLE = 8
+    INVALID = 16
+    INACCURATE = 32
 
 
 REMEDIES = {
-    Status.NOT_CONVERGED: "Newton stopped short: approach the command by ramp(scene, ratios, steps), with more steps, "
-    "or raise Newton.max_steps; the answer is not an equilibrium",
-    Status.NONFINITE: "energy or forces are not finite at the start: check parameters and x0 (an element must not be "
-    "inverted in a logarithmic material)",
-    Status.INVERTED: "an element is turned inside out (J <= 0): command less, use smaller ramp steps, a finer mesh or "
-    "a material that resists it, such as neo_hookean",
-    Status.UNSTABLE: "the equilibrium is a saddle, which a real beam leaves: start from a disturbed x0 to find the "
-    "stable states beside it",
+    Status.NOT_CONVERGED: "no equilibrium was reached: approach the command by ramp(scene, ratios, steps) with more "
+    "steps, raise Newton.max_steps, or command less; x is the last state that was in balance, not the answer",
+    Status.NONFINITE: "energy or forces are not finite: check parameters and x0, which must not invert an element "
+    "of a logarithmic material",
+    Status.INVERTED: "an element is turned inside out (J <= 0): command less, approach it by ramp, use a finer mesh "
+    "or a material that resists it, such as neo_hookean",
+    Status.UNSTABLE: "the equilibrium is a saddle, which a real beam leaves: set Newton(escape=True), or start from "
+    "x0 = x + a little of lowest_mode(scene, x)",
+    Status.INACCURATE: "forces balance to round-off, but positions are uncertain by more than a thousandth of "
+    "the body (see correction): use float64",
+    Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
+    "(-1, 0.5), all finite): build the scene outside jit to be told which",
 }
 
 
@@ -62,10 +73,17 @@ class Solution:
     energy: `()` total energy.
     residual: `()` largest unbalanced force on a free coordinate, over the force scale.
     tolerance: `()` what the residual had to reach.
-    steps: `()` Newton steps taken.
+    correction: `()` what one more Newton step would move, over the size of the body: how far round-off leaves
+        `x` from the equilibrium, along its softest directions.
+    steps: `()` Newton steps taken, all attempts together.
     projected: `()` how many of them used projected Hessians.
     halvings: `()` line-search halvings in all.
+    attempts: `()` Newton solves; more than 1 when a first one failed or ended on a saddle.
     smallest_jacobian: `()` smallest `J = det F` over the solids; infinite without one.
+    worst_element: `()` the element where it is.
+    ratios: `(m,)` commanded ratio of each tendon.
+    reached: `()` how far `x` got: 1 at the command itself; less where the way to it broke off, and then `x`
+        is the equilibrium at that fraction of the way.
     status: `()` int32 of or-ed `Status` flags; 0 is `OK`.
     """
 
@@ -73,56 +91,23 @@ class Solution:
     energy: jax.Array
     residual: jax.Array
     tolerance: jax.Array
+    correction: jax.Array
     steps: jax.Array
     projected: jax.Array
     halvings: jax.Array
+    attempts: jax.Array
     smallest_jacobian: jax.Array
+    worst_element: jax.Array
+    ratios: jax.Array
+    reached: jax.Array
     status: jax.Array
 
 
-@dataclasses.dataclass(frozen=True)
-class Newton:
-    """Settings of the equilibrium solver. Hashable: a change compiles anew.
-
-    max_steps: Newton steps before giving up.
-    rtol: relative residual to reach; by default 1e-10 in float64 and 1e-5 in float32.
-    linear: the linear solver, `BlockTridiagonal()` or `Dense()`.
-    keep_volume: no element falls below this fraction of its `J` in one step. It keeps elements from
-        inverting within a step, and logarithmic energies finite.
-    """
-
-    max_steps: int = 100
-    rtol: float | None = None
-    linear: LinearSolver = BlockTridiagonal()
-    keep_volume: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.max_steps, int | np.integer) or self.max_steps < 0:
-            raise ValueError(f"max_steps: expected a whole number of at least 0, got {self.max_steps!r}")
-        if self.rtol is not None and not 0 < self.rtol < 1:
-            raise ValueError(f"rtol: expected a number between 0 and 1, got {self.rtol!r}")
-        if not 0 < self.keep_volume < 1:
-            raise ValueError(f"keep_volume: expected a number between 0 and 1, got {self.keep_volume!r}")
-
-    def tolerance(self, dtype: Any) -> float:
-        """The relative residual to reach in this dtype."""
-        if self.rtol is not None:
-            return self.rtol
-        return 1e-10 if jnp.finfo(dtype).eps < 1e-10 else 1e-5
-
-
-# Line search. Armijo's constant is the usual one; `APPROXIMATE` is delta of Hager and Zhang (2005).
-ARMIJO = 1e-4
-APPROXIMATE = 0.1
-MAX_HALVINGS = 40
-# Round-off in a sum of `s` magnitudes is taken as this many eps * s.
-ROUND_OFF = 4.0
-# Shifts tried after the projected Hessian has failed, each ten times the one before.
-MAX_SHIFTS = 16
-
-
 def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton()) -> Solution:
-    """Node positions at which all forces balance, found by Newton's method from `x0`.
+    """Node positions at which all forces balance.
+
+    Newton's method starts at `x0`. If it fails, the actuation is approached from rest in steps as small as it
+    takes; if it ends on a saddle, it leaves for the stable state beside it (unless `solver.escape` is false).
 
     Args:
         scene: what to solve.
@@ -133,10 +118,18 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
         A `Solution`. It never raises for a solve that fails: its `status` says so, and `check` raises.
 
     Raises:
-        ValueError: if `x0` has another shape, or is concrete and not finite.
+        ValueError: if `x0` has another shape, or is concrete and not finite or inverts an element, or if a
+            piece of the mesh is not held and moves as a rigid body.
     """
+    check_held(scene)
     layout = solver.linear.layout(topology(scene))
     return _equilibrium(unlock(scene), layout, start(scene, x0), solver)
+
+
+@partial(jax.jit, static_argnames="solver")
+def _equilibrium(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> Solution:
+    path = follow(lambda s: partway(scene, s), layout, x, jnp.ones(1, x.dtype), solver)
+    return jax.tree.map(lambda leaf: leaf[0], path)
 
 
 def check(solution: Solution) -> Solution:
@@ -144,36 +137,46 @@ def check(solution: Solution) -> Solution:
 
     Raises:
         EquilibriumError: otherwise. Says which flags, which members of a batch, residual against
-            tolerance, steps, smallest `J`, and what to try.
+            tolerance, steps, smallest `J` and where, the command, and what to try.
         ValueError: if the solution is traced: statuses have no value inside jit.
     """
     if not is_concrete(solution.status):
         raise ValueError("solution: expected concrete values, got traced ones; call check outside jit, vmap and grad")
     status = np.asarray(solution.status)
-    bad = np.flatnonzero(status.ravel())
-    if not bad.size:
-        return solution
     lines = []
     for flag in Status:
         members = np.flatnonzero(status.ravel() & flag)
         if not members.size:
             continue
-        worst = members[0]
         where = ""
         if status.ndim:
             shown = ", ".join(str(m) for m in members[:8]) + (", ..." if members.size > 8 else "")
-            where = f" in {members.size} of {status.size} members ({shown}); the first of them:"
-        value = lambda field, k=worst: np.asarray(field).ravel()[k]
-        lines.append(
-            f"{flag.name}{where} residual {value(solution.residual):.3g} (tolerance {value(solution.tolerance):.3g}), "
-            f"{value(solution.steps)} steps, smallest J {value(solution.smallest_jacobian):.3g}. {REMEDIES[flag]}."
-        )
-    raise EquilibriumError("\n".join(lines))
+            where = f" in {members.size} of {status.size} members ({shown}), the first of them"
+        lines.append(f"{flag.name}{where}: {_describe(solution, members[0])}. {REMEDIES[flag]}.")
+    if lines:
+        raise EquilibriumError("\n".join(lines))
+    return solution
 
 
-def topology(scene: Scene) -> Topology:
-    """The structure of a scene, on which the layout of its matrix depends."""
-    return Topology(Key(scene.mesh.elements), Key(scene.fixed), tuple(Key(term.nodes) for term in scene.terms))
+def _describe(solution: Solution, member: int) -> str:
+    """The figures of one member of a batch, for an error's text."""
+
+    def of(field: jax.Array, rank: int = 0) -> np.ndarray:
+        array = np.asarray(field)
+        batch = array.shape[: array.ndim - rank]
+        return array[np.unravel_index(member, batch)] if batch else array
+
+    text = (
+        f"residual {of(solution.residual):.3g} (tolerance {of(solution.tolerance):.3g}) after {of(solution.steps)} "
+        f"Newton steps in {of(solution.attempts)} attempts, smallest J {of(solution.smallest_jacobian):.3g} in element "
+        f"{of(solution.worst_element)}"
+    )
+    ratios = of(solution.ratios, 1)
+    if ratios.size:
+        text += f", command {[float(f'{r:.6g}') for r in ratios]}"
+    if of(solution.reached) < 1:
+        text += f", broken off at {of(solution.reached):.4g} of the way to it"
+    return text
 
 
 def start(scene: Scene, x0: Numbers | None) -> jax.Array:
@@ -183,165 +186,202 @@ def start(scene: Scene, x0: Numbers | None) -> jax.Array:
         return rest
     if np.shape(x0) != rest.shape:
         raise ValueError(f"x0: expected node positions of shape {rest.shape}, got {np.shape(x0)}")
-    if is_concrete(x0) and not np.isfinite(np.asarray(x0)).all():
-        node = np.flatnonzero(~np.isfinite(np.asarray(x0)).all(axis=1))[0]
-        raise ValueError(f"x0: expected finite positions, got {np.asarray(x0)[node].tolist()} at node {node}")
-    return jnp.where(scene.fixed, rest, jnp.asarray(x0, rest.dtype))
+    x = jnp.where(scene.fixed, rest, jnp.asarray(x0, rest.dtype))
+    if is_concrete(x0, rest):
+        finite = np.isfinite(np.asarray(x0)).all(axis=1)
+        if not finite.all():
+            node = np.flatnonzero(~finite)[0]
+            raise ValueError(f"x0: expected finite positions, got {np.asarray(x0)[node].tolist()} at node {node}")
+        volume, element = _worst_element(unlock(scene), x)
+        if not volume > 0:
+            raise ValueError(
+                f"x0: element {element} is inverted (J = {float(volume):.3g}); start from rest, or from a "
+                f"state in which every J is positive"
+            )
+    return x
 
 
-# ------------------------------------------------------------------------------------- Newton's method
+_worst_element = jax.jit(worst_element)
 
 
-class State(NamedTuple):
-    """Where Newton's method stands; `factor` is that of the last Hessian, true if `definite`."""
+# --------------------------------------------------------------------------------- along a path of scenes
 
+# Newton steps that the first attempt at a target may take: beyond this a shorter way is quicker. Each failure allows
+# the next as many more, for past a fold no way is short enough.
+ATTEMPT_STEPS = 60
+# Full steps at the beginning of an attempt from a predicted start, which need not lower the energy: beside a stiff
+# tendon the way down is a curved valley, and a search for lower energy crawls along it.
+FREE_STEPS = 8
+# Times that the way to a target is halved before it is given up, and saddles are left before one is kept.
+MAX_CUTS = 20
+MAX_ESCAPES = 4
+# How far a saddle is left at first, over the size of the body.
+ESCAPE = 1e-3
+# Attempts at one target, whatever they cost.
+MAX_ATTEMPTS = 100
+
+
+class Walk(NamedTuple):
+    """Where `follow` stands. The path's parameter is `s`; `x` is the equilibrium found last, at `s`."""
+
+    leg: jax.Array  # index of the target walked to
+    s: jax.Array
     x: jax.Array
-    at: Evaluation
     factor: Any
-    definite: jax.Array
-    residual: jax.Array
-    steps: jax.Array
-    projected: jax.Array
-    halvings: jax.Array
+    usable: jax.Array  # whether factor is that of a stable tangent at x
+    trial: jax.Array  # parameter tried next
+    start: jax.Array  # positions it starts from
+    increment: jax.Array
+    cuts: jax.Array  # failures on the way to this target
+    escapes: jax.Array
+    spent: Solution  # counters of the attempts at this target so far
+    path: Solution
     running: jax.Array
 
 
-@partial(jax.jit, static_argnames="solver")
-def _equilibrium(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> Solution:
-    return report(scene, newton(scene, layout, x, solver), solver)
+def follow(
+    scene_at: Callable[[jax.Array], Scene], layout: Layout, x: jax.Array, targets: jax.Array, solver: Newton
+) -> Solution:
+    """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
 
-
-def newton(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> State:
-    """Newton's method from `x`, for a scene with unlocked indices; to be called inside jit.
-
-    The state it ends in holds the factor of the true Hessian at `x`, for derivatives and predictors.
+    The first attempt goes from `x` straight to the first target. One that fails is made in smaller steps, from
+    the last good state (at first: the rest positions at `s = 0`), along the tangent of the branch; steps
+    grow again while they succeed. When they have become too small the walk ends: what remains is reported
+    `NOT_CONVERGED`, at the last good state.
     """
-    rtol = solver.tolerance(x.dtype)
-    empty = jnp.zeros(layout.empty.shape, x.dtype)
-    factor, _ = jax.eval_shape(solver.linear.factor, layout, empty)
-    factor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), factor)
-    count, no, inf = jnp.zeros((), jnp.int32), jnp.asarray(False), jnp.asarray(jnp.inf, x.dtype)
-    first = State(x, evaluate(scene, x), factor, no, inf, count, count, count, ~no)
+    count = jnp.zeros((), jnp.int32)
+    rest = scene_at(targets[0])
+    one = jax.eval_shape(lambda: _report(rest, newton(rest, layout, x, count, count, solver), solver))
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), one)
+    path = jax.tree.map(lambda leaf: jnp.zeros((targets.shape[0], *leaf.shape), leaf.dtype), empty)
+    zero, no = jnp.zeros((), x.dtype), jnp.asarray(False)
+    noise = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape), x.dtype)
+    factor = no_factor(layout, x.dtype, solver)
+    walk = Walk(count, zero, rest.mesh.nodes, factor, no, targets[0], x, targets[0], count, count, empty, path, ~no)
 
-    def body(state: State) -> State:
-        hessians = stencil_hessians(scene, state.x)
-        storage = assemble(layout, hessians)
-        gradient = gather(layout, state.at.gradient)
-        residual = jnp.max(jnp.abs(gradient)) / force_scale(layout, storage, state.x, state.at, rtol)
-        wanted = (residual > rtol) & (state.steps < solver.max_steps)  # false for NaN: nothing to go on from
-        factor, definite = solver.linear.factor(layout, storage)
-        factor, usable = convexify(layout, hessians, storage, factor, definite | ~wanted, solver)
-        step = expand(layout, -solver.linear.solve(layout, factor, gradient), state.x.shape)
-        x, at, halvings, moved = line_search(scene, state, step, wanted & usable, solver)
-        return State(
+    def attempt(walk: Walk) -> Walk:
+        scene = scene_at(walk.trial)
+        target = targets[walk.leg]
+        budget = jnp.minimum(ATTEMPT_STEPS * (1 + walk.cuts), solver.max_steps - walk.spent.steps)
+        state = newton(scene, layout, walk.start, budget, jnp.where(walk.usable, FREE_STEPS, 0), solver)
+        found = _add_counters(_report(scene, state, solver), walk.spent)
+        valid = is_valid(scene_at(target))
+        found = replace(found, status=found.status | jnp.where(valid, 0, jnp.int32(Status.INVALID)))
+        converged = (found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
+        saddle = converged & ~state.definite & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
+        spent_out = (found.steps >= solver.max_steps) | (found.attempts >= MAX_ATTEMPTS) | ~valid
+        may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > walk.s) & ~spent_out
+        # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
+        good = converged & ~saddle & ~((found.smallest_jacobian <= 0) & may_cut)
+        landed = good & (walk.trial == target)
+        failed = ~good & ~saddle
+        over = (~landed & spent_out) | (failed & ~may_cut)
+
+        s, x = _choose(good, (walk.trial, state.x), (walk.s, walk.x))
+        factor = _choose(good, state.factor, walk.factor)
+        usable = jnp.where(good, state.definite, walk.usable)
+        increment = jnp.where(good, 2 * walk.increment, jnp.where(saddle, walk.increment, 0.5 * (walk.trial - walk.s)))
+        # A target reached at once invites to walk straight to the next one.
+        easy = landed & ((found.attempts == 1) | (walk.increment <= 0))
+        increment = jnp.where(easy, 1.0, increment).astype(x.dtype)
+        leg = jnp.minimum(walk.leg + landed.astype(jnp.int32), targets.shape[0] - 1)
+        # Landing a hair short of the target would leave a step of no length.
+        ahead = jnp.where(over | (s + 1.01 * increment >= targets[leg]), targets[leg], s + increment)
+        trial = jnp.where(saddle & ~over, walk.trial, ahead)
+
+        following = scene_at(trial)
+        at = evaluate(following, x)
+        entry = _choose(over, _broken_off(following, found, x, at, s / target), found)
+        here = jnp.arange(targets.shape[0])
+        write = jnp.where(over, here >= walk.leg, landed & (here == walk.leg))
+        path = jax.tree.map(lambda all, new: jnp.where(write.reshape(-1, *[1] * new.ndim), new, all), walk.path, entry)
+
+        # From a saddle along its soft modes, as the factor of the Hessian there filters them out of noise; else along
+        # the tangent: the forces left unbalanced at x are the increment of the next scene.
+        direction = jnp.where(saddle, noise, at.gradient)
+        chosen = _choose(saddle, state.factor, factor)
+        step = expand(layout, -solver.linear.solve(layout, chosen, gather(layout, direction)), x.shape)
+        step = jnp.where(saddle, ESCAPE * jnp.max(jnp.abs(x)) / jnp.max(jnp.abs(step)), 1.0) * step
+        base = jnp.where(saddle, state.x, x)
+        length = jnp.minimum(1.0, largest_step(following, base, step, solver.keep_volume)).astype(x.dtype)
+        move = (saddle | usable) & jnp.all(jnp.isfinite(step))
+        return Walk(
+            leg=leg,
+            s=s,
             x=x,
-            at=at,
             factor=factor,
-            definite=definite,
-            residual=residual,
-            steps=state.steps + moved,
-            projected=state.projected + (moved & ~definite),
-            halvings=state.halvings + halvings,
-            running=moved,
+            usable=usable,
+            trial=trial,
+            start=jnp.where(move, base + length * step, base),
+            increment=increment,
+            cuts=jnp.where(landed & (found.status == 0), 0, walk.cuts + failed.astype(jnp.int32)),
+            escapes=jnp.where(good, 0, walk.escapes + saddle.astype(jnp.int32)),
+            spent=_choose(landed, empty, found),
+            path=path,
+            running=~over & ~(landed & (walk.leg == targets.shape[0] - 1)),
         )
 
-    return lax.while_loop(lambda state: state.running, body, first)
+    return lax.while_loop(lambda walk: walk.running, attempt, walk).path
 
 
-def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
-    """What an unbalanced force is compared with, `()`.
-
-    The largest sum of magnitudes of the stencil forces at one coordinate, plus what makes `rtol` times the
-    scale no smaller than the round-off of the forces: positions carry a relative error eps, which the
-    stiffness turns into a force of `eps * max |x| * max K_ii` that no iteration can remove.
-    """
-    unknown = layout.slots < layout.position.size
-    stiffness = jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
-    round_off = ROUND_OFF * jnp.finfo(x.dtype).eps * stiffness * jnp.max(jnp.abs(x))
-    return jnp.max(at.gradient_scale) + round_off / rtol
+# A correction, over the size of the body, that makes an answer inaccurate.
+INACCURATE = 1e-3
 
 
-def convexify(
-    layout: Layout, hessians: list[jax.Array], storage: jax.Array, factor: Any, done: jax.Array, solver: Newton
-) -> tuple[Any, jax.Array]:
-    """A positive definite factor where the true one failed: projected stencils, then shifted as well.
-
-    A loop and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would always pay.
-    """
-    stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
-
-    def attempt(carry: Any) -> Any:
-        # Tied to the loop's counter: XLA moves what does not change out of a loop, and the projection
-        # would be computed in every Newton step, needed or not.
-        tries, stencils = lax.optimization_barrier((carry[0], hessians))
-        convex = assemble(layout, [project(h) for h in stencils])
-        shift = jnp.where(tries > 0, stiffness * 10.0 ** (tries - 10), 0).astype(storage.dtype)
-        factor, done = solver.linear.factor(layout, convex.at[layout.diagonal].add(shift))
-        return tries + 1, factor, done
-
-    carry = (jnp.zeros((), jnp.int32), factor, done)
-    _, factor, done = lax.while_loop(lambda c: ~c[2] & (c[0] < MAX_SHIFTS), attempt, carry)
-    return factor, done
-
-
-def line_search(
-    scene: Scene, state: State, step: jax.Array, wanted: jax.Array, solver: Newton
-) -> tuple[jax.Array, Evaluation, jax.Array, jax.Array]:
-    """Halve the step until the energy falls; `(x, evaluation, halvings, moved)`.
-
-    Near the solution differences of energy drown in round-off. There the slope decides: the approximate
-    Wolfe condition of Hager and Zhang (2005), SIAM J. Optim. 16, eq. 4.1, holds for an energy that rises
-    by no more than its round-off.
-    """
-    slope = jnp.sum(state.at.gradient * step)
-    # Round-off of the energy: of its sum, and of the positions it is evaluated at.
-    magnitude = state.at.energy_scale + jnp.max(jnp.abs(state.x)) * jnp.sum(state.at.gradient_scale)
-    noise = ROUND_OFF * jnp.finfo(step.dtype).eps * magnitude
-    length = jnp.minimum(1.0, largest_step(scene, state.x, step, solver.keep_volume)).astype(step.dtype)
-    wanted = wanted & jnp.isfinite(slope) & (slope < 0)
-
-    def trial(carry: Any) -> Any:
-        count, _, _, _ = carry
-        t = length * 0.5 ** count.astype(step.dtype)
-        x = state.x + t * step
-        at = evaluate(scene, x)
-        end_slope = jnp.sum(at.gradient * step)
-        falls = at.energy <= state.at.energy + ARMIJO * t * slope
-        flat = (at.energy <= state.at.energy + noise) & (end_slope <= (2 * APPROXIMATE - 1) * slope)
-        finite = jnp.isfinite(at.energy) & jnp.isfinite(end_slope)
-        return count + 1, x, at, (falls | flat) & finite
-
-    carry = (jnp.zeros((), jnp.int32), state.x, state.at, ~wanted)
-    count, x, at, accepted = lax.while_loop(lambda c: ~c[3] & (c[0] <= MAX_HALVINGS), trial, carry)
-    moved = wanted & accepted
-    keep = lambda new, old: jnp.where(moved, new, old)
-    return keep(x, state.x), jax.tree.map(keep, at, state.at), jnp.maximum(count - 1, 0), moved
-
-
-def report(scene: Scene, state: State, solver: Newton) -> Solution:
-    """The `Solution` of a state that has come to rest."""
+def _report(scene: Scene, state: State, solver: Newton) -> Solution:
+    """The `Solution` of one attempt."""
     rtol = solver.tolerance(state.x.dtype)
     converged = state.residual <= rtol
     finite = jnp.isfinite(state.at.energy) & jnp.all(jnp.isfinite(state.at.gradient))
-    volume = smallest_jacobian(scene, state.x)
-
-    def flag(raised: jax.Array, which: Status) -> jax.Array:
-        return jnp.where(raised, jnp.int32(which), 0)
-
-    status = (
-        flag(~converged, Status.NOT_CONVERGED)
-        | flag(~finite, Status.NONFINITE)
-        | flag(~(volume > 0), Status.INVERTED)
-        | flag(converged & ~state.definite, Status.UNSTABLE)
-    )
+    volume, element = worst_element(scene, state.x)
+    correction = jnp.max(jnp.abs(state.step)) / jnp.max(jnp.abs(state.x))
+    raised = {
+        Status.NOT_CONVERGED: ~converged,
+        Status.NONFINITE: ~finite,
+        Status.INVERTED: ~(volume > 0),
+        Status.UNSTABLE: converged & ~state.definite,
+        Status.INACCURATE: converged & state.definite & (correction > INACCURATE),
+    }
     return Solution(
         x=state.x,
         energy=state.at.energy,
         residual=state.residual,
         tolerance=jnp.full((), rtol, state.x.dtype),
+        correction=correction,
         steps=state.steps,
         projected=state.projected,
         halvings=state.halvings,
+        attempts=jnp.ones((), jnp.int32),
         smallest_jacobian=volume,
-        status=status,
+        worst_element=element,
+        ratios=ratios_of(scene),
+        reached=jnp.ones((), state.x.dtype),
+        status=sum((jnp.where(up, jnp.int32(flag), 0) for flag, up in raised.items()), jnp.zeros((), jnp.int32)),
     )
+
+
+def _broken_off(scene: Scene, found: Solution, x: jax.Array, at: Evaluation, reached: jax.Array) -> Solution:
+    """The report of a target that was not reached: the last good state `x`, judged by the target's own forces."""
+    volume, element = worst_element(scene, x)
+    return replace(
+        found,
+        x=x,
+        energy=at.energy,
+        residual=jnp.max(jnp.where(scene.fixed, 0, jnp.abs(at.gradient))) / jnp.max(at.gradient_scale),
+        smallest_jacobian=volume,
+        worst_element=element,
+        ratios=ratios_of(scene),
+        reached=reached,
+        status=(found.status & ~jnp.int32(Status.UNSTABLE | Status.INVERTED))
+        | Status.NOT_CONVERGED
+        | jnp.where(volume > 0, 0, jnp.int32(Status.INVERTED)),
+    )
+
+
+def _add_counters(found: Solution, spent: Solution) -> Solution:
+    names = ("steps", "projected", "halvings", "attempts")
+    return replace(found, **{name: getattr(found, name) + getattr(spent, name) for name in names})
+
+
+def _choose(condition: jax.Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -71,6 +71,12 @@ class LinearSolver(Protocol):
 
     def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array: ...
 
+    def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[Any, jax.Array]:
+        """Factor of a matrix of any inertia, and how many of its eigenvalues are negative."""
+        ...
+
+    def solve_indefinite(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array: ...
+
 
 class Topology(NamedTuple):
     """What a layout depends on, hashable: elements, fixed coordinates and the nodes of every term."""
@@ -116,6 +122,13 @@ class Dense:
         half = lax.linalg.triangular_solve(factor, rhs[:, None], left_side=True, lower=True)
         return lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
 
+    def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array]:
+        size = layout.blocks[1]
+        return _inverse(storage.reshape(size, size))
+
+    def solve_indefinite(self, layout: Layout, factor: jax.Array, rhs: jax.Array) -> jax.Array:
+        return factor @ rhs
+
 
 @lru_cache(maxsize=32)
 def _dense_layout(topology: Topology) -> Layout:
@@ -159,11 +172,8 @@ class BlockTridiagonal:
         return _bordered_layout(topology)
 
     def factor(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
-        b, w, r = layout.blocks
-        split = np.cumsum([b * w * w, b * w * w, b * w * r])
-        pieces = jnp.split(storage, split)
-        diagonal, lower = pieces[0].reshape(b, w, w), pieces[1].reshape(b, w, w)
-        border, corner = pieces[2].reshape(b, w, r), pieces[3].reshape(r, r)
+        w, r = layout.blocks[1:]
+        diagonal, lower, border, corner = _pieces(layout, storage)
 
         def eliminate(carry: Any, block: Any) -> Any:
             pivot, above, schur = carry
@@ -206,6 +216,64 @@ class BlockTridiagonal:
         start = jnp.zeros((w, 1), rhs.dtype)
         _, inner = lax.scan(backward, start, (factor.pivot, factor.lower, inner), reverse=True)
         return jnp.concatenate([inner.reshape(b * w), outer.reshape(r)])
+
+    def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
+        """Block `L D L^T` with the pivots `D` inverted through their eigenvalues.
+
+        The inertia of the matrix is the sum of its pivots' (Haynsworth 1968).
+        """
+        w, r = layout.blocks[1:]
+        diagonal, lower, border, corner = _pieces(layout, storage)
+
+        def eliminate(carry: Any, block: Any) -> Any:
+            above, border_above, schur, count = carry
+            diagonal, lower, border = block
+            ahead = lower @ above
+            inverse, negative = _inverse(diagonal - ahead @ lower.T)
+            border = border - ahead @ border_above
+            schur = schur - border.T @ inverse @ border
+            return (inverse, border, schur, count + negative), (inverse, border)
+
+        zeros = jnp.zeros((w, w + r), storage.dtype)
+        carry = (zeros[:, :w], zeros[:, w:], corner, jnp.zeros((), jnp.int32))
+        (_, _, schur, count), (inverse, border) = lax.scan(eliminate, carry, (diagonal, lower, border))
+        corner, negative = _inverse(schur)
+        return BorderedFactor(inverse, lower, border, corner), count + negative
+
+    def solve_indefinite(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
+        b, w, _ = layout.blocks
+        inner, outer = rhs[: b * w].reshape(b, w), rhs[b * w :]
+
+        def forward(above: jax.Array, block: Any) -> Any:
+            inverse, lower, right = block
+            y = right - lower @ above
+            return inverse @ y, y
+
+        _, inner = lax.scan(forward, jnp.zeros(w, rhs.dtype), (factor.pivot, factor.lower, inner))
+        outer = outer - jnp.einsum("bwr,bwv,bv->r", factor.border, factor.pivot, inner)
+        outer = factor.corner @ outer
+        inner = inner - factor.border @ outer
+
+        def backward(carry: jax.Array, block: Any) -> Any:
+            inverse, lower, right = block
+            y = inverse @ (right - carry)
+            return lower.T @ y, y
+
+        _, inner = lax.scan(backward, jnp.zeros(w, rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True)
+        return jnp.concatenate([inner.reshape(b * w), outer])
+
+
+def _pieces(layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Diagonal and lower blocks `(b, w, w)`, border `(b, w, r)` and corner `(r, r)` of a stored matrix."""
+    b, w, r = layout.blocks
+    diagonal, lower, border, corner = jnp.split(storage, np.cumsum([b * w * w, b * w * w, b * w * r]))
+    return diagonal.reshape(b, w, w), lower.reshape(b, w, w), border.reshape(b, w, r), corner.reshape(r, r)
+
+
+def _inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Inverse of a symmetric matrix, and how many of its eigenvalues are negative."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return (vectors / values) @ vectors.T, jnp.sum(values < 0, dtype=jnp.int32)
 
 
 @lru_cache(maxsize=32)

@@ -77,7 +77,28 @@ def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
     det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
     volume = H[0, 0] + H[1, 1] + det
     log_j = jnp.log1p(volume)
-    return params.mu * (0.5 * jnp.sum(H * H) - det + (volume - log_j)) + 0.5 * params.lam * log_j**2
+    return params.mu * (0.5 * jnp.sum(H * H) - det + _less_log1p(volume)) + 0.5 * params.lam * log_j**2
+
+
+@jax.custom_jvp
+def _less_log1p(v: jax.Array) -> jax.Array:
+    """`v - ln(1 + v)`, about `v^2 / 2`, without the cancellation that would eat the digits of small strains.
+
+    With `s = v / (2 + v)`, `ln(1 + v) = 2 atanh s` and `v - 2 s = s v`, so it is `s v - 2 (s^3/3 + s^5/5 + ...)`.
+    """
+    small = jnp.abs(v) < 0.25
+    w = jnp.where(small, v, 0)
+    s = w / (2 + w)
+    t, series = s * s, jnp.zeros_like(v)
+    for k in range(17, 1, -2):
+        series = t * (1 / k + series)
+    return jnp.where(small, s * (w - 2 * series), v - jnp.log1p(v))
+
+
+@_less_log1p.defjvp
+def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    (v,), (dv,) = primals, tangents
+    return _less_log1p(v), v / (1 + v) * dv
 
 
 def saint_venant_kirchhoff(H: jax.Array, params: Lame) -> jax.Array:

@@ -157,6 +157,19 @@ def nearest_node(mesh: Mesh, point: Numbers) -> int:
     return int(np.argmin(np.sum((_concrete_nodes(mesh) - target) ** 2, axis=1)))
 
 
+def pieces(elements: np.ndarray, count: int) -> np.ndarray:
+    """`(n,)` number, from 0, of the connected piece that each of `count` nodes belongs to."""
+    label = np.arange(count)
+    while True:
+        lowest = label[elements].min(axis=1)
+        lower = label.copy()
+        np.minimum.at(lower, elements, lowest[:, None])
+        lower = lower[lower]
+        if (lower == label).all():
+            return np.unique(label, return_inverse=True)[1].ravel()
+        label = lower
+
+
 def _concrete_nodes(mesh: Mesh) -> np.ndarray:
     if not is_concrete(mesh.nodes):
         raise ValueError(

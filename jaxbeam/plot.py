@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from jaxbeam._tree import Numbers
+from jaxbeam.branch import Branch
 from jaxbeam.measures import tendon_tensions, tip_angle
 from jaxbeam.scene import Scene, command, solid_terms, tendon_terms
 
@@ -36,6 +37,7 @@ PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
 PUSHING = (0, (2.2, 1.3))
+UNSTABLE = (0, (3.0, 1.8))
 # Width of a figure in inches: the text width of a paper.
 PAPER = 7.2
 # Frames for which an animation rests on its last state.
@@ -229,6 +231,62 @@ def curves(
     ax.spines[["top", "right"]].set_visible(False)
     if len(ax.lines) > 1:
         ax.legend(frameon=False, fontsize="small")
+    return ax
+
+
+def branches(
+    scene: Scene,
+    traced: Sequence[Branch],
+    measure: Callable[[Scene, jax.Array], jax.Array] = tip_angle,
+    label: str = "tip angle (degrees)",
+    *,
+    ax: Axes | None = None,
+) -> Axes:
+    """A measure along branches of equilibria: stable full, unstable dashed, folds and bifurcations marked.
+
+    Args:
+        scene: that was traced.
+        traced: of `trace_branch`; each has a colour of its own.
+        measure: `(scene, x)` to a scalar.
+        label: of the vertical axis: quantity and unit.
+        ax: where to draw; by default a new figure.
+
+    Raises:
+        ValueError: if `traced` is empty.
+    """
+    if not traced:
+        raise ValueError("traced: expected at least one Branch, got none")
+    if ax is None:
+        ax = Figure(figsize=(0.62 * PAPER, 0.42 * PAPER), layout="constrained").add_subplot()
+    shown = {}
+    for number, branch in enumerate(traced):
+        colour, critical = PALETTE[number % len(PALETTE)], branch.critical
+        # Critical points go between their neighbours: there a line changes from full to dashed.
+        order = np.argsort([*range(len(branch.x)), *(each.after + 0.5 for each in critical)])
+        commands = np.concatenate([branch.ratios, *(each.ratios[None] for each in critical)])
+        x = np.concatenate([branch.x, *(np.asarray(each.x)[None] for each in critical)])
+        states = States(scene, commands, x)
+        along, values = states.actuation, states.measure(measure)
+        negative = np.append(branch.negative, np.zeros(len(critical), int))[order]
+        stable = np.maximum(negative[:-1], negative[1:]) == 0
+        for run in np.split(np.arange(stable.size), np.flatnonzero(np.diff(stable)) + 1):
+            points = order[[*run, run[-1] + 1]]
+            name = "stable" if stable[run[0]] else "unstable"
+            style: Any = "-" if stable[run[0]] else UNSTABLE
+            ax.plot(along[points], values[points], color=colour, linestyle=style, linewidth=1.4)
+            shown[name] = Line2D([], [], color=OUTLINE, linestyle=style, linewidth=1.4, label=name)
+        for place, each in enumerate(critical, len(branch.x)):
+            look: dict[str, Any] = {"linestyle": "", "color": OUTLINE, "markersize": 5, "zorder": 4}
+            look |= {"marker": "D"} if each.kind == "bifurcation" else {"marker": "o", "markerfacecolor": "white"}
+            ax.plot(along[place], values[place], **look)
+            shown[each.kind] = Line2D([], [], label=each.kind, **look)
+    ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
+    if not ax.xaxis_inverted():
+        ax.invert_xaxis()
+    ax.grid(color="0.9", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(handles=list(shown.values()), frameon=False, fontsize="small")
     return ax
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only, replace
-from jaxbeam.materials import lame, macklin_mueller
+from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, rectangle
 from jaxbeam.terms import (
     SolidEnergy,
@@ -23,6 +23,8 @@ from jaxbeam.terms import (
     Term,
     admissible_step,
     check_nodes,
+    dead_load_energy,
+    forbids_inversion,
     inverse_square_stiffness,
     solid,
     tendons,
@@ -162,6 +164,41 @@ def command(scene: Scene, ratios: Numbers) -> Scene:
     return replace(scene, terms=tuple(terms))
 
 
+def partway(scene: Scene, fraction: jax.Array) -> Scene:
+    """The scene with only a fraction of its actuation: of every tendon's shortening and every dead load."""
+    terms = []
+    for term in scene.terms:
+        params = term.params
+        if isinstance(term.energy, TendonEnergy):
+            params = replace(params, commanded=(1 - fraction) * params.natural + fraction * params.commanded)
+        elif term.energy is dead_load_energy:
+            params = replace(params, value=fraction * params.value)
+        terms.append(replace(term, params=params))
+    return replace(scene, terms=tuple(terms))
+
+
+def ratios_of(scene: Scene) -> jax.Array:
+    """The ratio `(m,)` that each tendon is commanded to now."""
+    found = [term.params.commanded / term.params.natural for term in tendon_terms(scene)]
+    return jnp.concatenate([*found, jnp.zeros(0, scene.mesh.nodes.dtype)])
+
+
+def is_valid(scene: Scene) -> jax.Array:
+    """Whether every parameter `()` is in its range: what the builders check, for values that were traced."""
+    valid = jnp.all(jnp.isfinite(scene.mesh.nodes))
+    for term in scene.terms:
+        for leaf in jax.tree.leaves(term.params):
+            valid &= jnp.all(jnp.isfinite(leaf)) if jnp.issubdtype(leaf.dtype, jnp.inexact) else True
+        if isinstance(term.energy, TendonEnergy):
+            valid &= jnp.all((term.params.commanded > 0) & (term.params.modulus > 0))
+        if isinstance(term.energy, SolidEnergy):
+            valid &= jnp.all(term.params.weights > 0)
+            if isinstance(material := term.params.material, Lame):
+                # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
+                valid &= jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
+    return valid
+
+
 def tendon_terms(scene: Scene) -> list[Term]:
     """The terms that are tendons, in order; their tendons are numbered through."""
     return [term for term in scene.terms if isinstance(term.energy, TendonEnergy)]
@@ -229,15 +266,35 @@ def stencil_hessians(scene: Scene, x: jax.Array) -> list[jax.Array]:
 
 
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
-    """Smallest `J = det F` over the solids at `x`; infinite for a scene without one."""
-    ratios = [jnp.min(jax.vmap(volume_ratios)(x[t.nodes], t.params)) for t in solid_terms(scene)]
-    return jnp.min(jnp.stack([jnp.asarray(jnp.inf, x.dtype), *ratios]))
+    """Smallest `J = det F` `()` over the solids at `x`; infinite for a scene without one."""
+    return worst_element(scene, x)[0]
+
+
+def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The smallest `J` `()` over the solids and the number `()` of its element (-1 in a scene without solids)."""
+    ratios = [jnp.min(jax.vmap(volume_ratios)(x[t.nodes], t.params), axis=1) for t in solid_terms(scene)]
+    if not ratios:
+        return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
+    every = jnp.concatenate(ratios)
+    element = jnp.argmin(every)
+    return every[element], element.astype(jnp.int32)
+
+
+# An element under this `J` is let through zero, where its energy allows that: held back, it would be approached
+# in ever smaller steps. It may well come back, and if it does not, the solution says so.
+RELEASED = 0.1
 
 
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
-    """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`."""
-    limits = [
-        jnp.min(jax.vmap(admissible_step, in_axes=(0, 0, 0, None))(x[t.nodes], dx[t.nodes], t.params, keep))
-        for t in solid_terms(scene)
-    ]
-    return jnp.min(jnp.stack([jnp.asarray(jnp.inf, x.dtype), *limits]))
+    """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
+
+    An element of a density that forbids inversion always does; one of another only while it is not under
+    `RELEASED`.
+    """
+    limits = [jnp.asarray(jnp.inf, x.dtype)]
+    for term in solid_terms(scene):
+        assert isinstance(term.energy, SolidEnergy)
+        bound = 0.0 if forbids_inversion(term.energy, term.params) else RELEASED
+        limit = jax.vmap(admissible_step, in_axes=(0, 0, 0, None, None))
+        limits.append(jnp.min(limit(x[term.nodes], dx[term.nodes], term.params, keep, bound)))
+    return jnp.min(jnp.stack(limits))

@@ -87,6 +87,14 @@ class SolidEnergy:
         return jnp.sum(params.weights * densities)
 
 
+def forbids_inversion(energy: SolidEnergy, params: SolidParams) -> bool:
+    """Whether the density is infinite or undefined for an inverted element, as a logarithmic one is."""
+    with jax.ensure_compile_time_eval():
+        ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
+        inverted = jnp.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
+        return not bool(jnp.isfinite(energy.density(inverted, ones)))
+
+
 def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
     """`H = F - I` `(q, 2, 2)` of one element at its quadrature points."""
     return jnp.einsum("ki,qkj->qij", x - params.rest, params.gradients)
@@ -98,12 +106,12 @@ def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
     return 1 + H[:, 0, 0] + H[:, 1, 1] + (H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] * H[:, 1, 0])
 
 
-def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: float) -> jax.Array:
+def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: float, bound: float = 0.0) -> jax.Array:
     """Largest `t` for which no point of one element falls below `keep` times its present `J` on `x + t dx`.
 
     In the plane `J(t) = J + b t + c t^2` with `b = cof F : dH`, `c = det dH`, so the first crossing is the
     root of a quadratic, taken in the form that does not cancel. Infinite where `J` never falls so far, and
-    where the element is inverted already (then only the energy can judge).
+    where `J` is at or under `bound` already.
     """
     F = displacement_gradients(x, params) + jnp.eye(2, dtype=x.dtype)
     D = jnp.einsum("ki,qkj->qij", dx, params.gradients)
@@ -113,7 +121,7 @@ def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: floa
     gap = (1 - keep) * j
     discriminant = b**2 - 4 * c * gap
     denominator = jnp.sqrt(jnp.maximum(discriminant, 0)) - b
-    crosses = (j > 0) & (discriminant >= 0) & (denominator > 0)
+    crosses = (j > bound) & (discriminant >= 0) & (denominator > 0)
     return jnp.min(jnp.where(crosses, 2 * gap / jnp.where(crosses, denominator, 1), jnp.inf))
 
 

@@ -11,12 +11,14 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 NUMBERS = {
     "01_steer_beam": {"top pulled": 35.5152802, "bottom pulled": -34.9502718, "both pulled": -5.0890962},
     "02_ramp_curves": {"top pulled": 956.0045},
+    "04_buckling": {"pulled in steps": -5.0890962},
     "03_own_energy": {"without ground": -34.9502718, "with ground": -7.8098},
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
     "02_ramp_curves": {"tip_angle.png", "tendons.png", "fields_top.png", "fields_both.png"},
     "03_own_energy": {"ground.png"},
+    "04_buckling": {"branches.png", "modes.png", "equilibria.png"},
 }
 
 

@@ -1,0 +1,245 @@
+"""Newton's method for the unknown node positions of one scene, inside jit.
+
+A step takes the true Hessian whenever its Cholesky factor exists, and only where it does not one blended with
+the Hessian projected stencil by stencil: always projecting would make convergence linear. At a solution the
+true factor exists if and only if the equilibrium is stable.
+
+The residual is relative: the largest unbalanced force on a free coordinate over the *force scale*, the largest
+sum of the magnitudes of the stencil forces that meet at one coordinate. So a change of units changes nothing.
+Forces smaller than round-off can tell apart count as balanced: see `force_scale`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxbeam._tree import Key
+from jaxbeam.linear import BlockTridiagonal, Layout, LinearSolver, Topology, assemble, expand, gather
+from jaxbeam.linear import project_semidefinite as project
+from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
+
+
+@dataclasses.dataclass(frozen=True)
+class Newton:
+    """Settings of the equilibrium solver. Hashable: a change compiles anew.
+
+    max_steps: Newton steps before giving up on one equilibrium, all attempts at it together.
+    rtol: relative residual to reach; by default 1e-10 in float64 and 1e-6 in float32.
+    linear: the linear solver, `BlockTridiagonal()` or `Dense()`.
+    keep_volume: no element falls below this fraction of its `J` in one step. It keeps elements from
+        inverting within a step, and logarithmic energies finite.
+    escape: leave a saddle along its lowest mode for the stable equilibrium beside it. Without it a saddle
+        is returned as it is found, flagged `UNSTABLE`.
+    """
+
+    max_steps: int = 2000
+    rtol: float | None = None
+    linear: LinearSolver = BlockTridiagonal()
+    keep_volume: float = 0.1
+    escape: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.max_steps, int | np.integer) or self.max_steps < 0:
+            raise ValueError(f"max_steps: expected a whole number of at least 0, got {self.max_steps!r}")
+        if self.rtol is not None and not 0 < self.rtol < 1:
+            raise ValueError(f"rtol: expected a number between 0 and 1, got {self.rtol!r}")
+        if not 0 < self.keep_volume < 1:
+            raise ValueError(f"keep_volume: expected a number between 0 and 1, got {self.keep_volume!r}")
+
+    def tolerance(self, dtype: Any) -> float:
+        """The relative residual to reach in this dtype."""
+        if self.rtol is not None:
+            return self.rtol
+        return 1e-10 if jnp.finfo(dtype).eps < 1e-10 else 1e-6
+
+
+# Line search. Armijo's constant is the usual one; `APPROXIMATE` is delta of Hager and Zhang (2005).
+ARMIJO = 1e-4
+APPROXIMATE = 0.1
+MAX_HALVINGS = 40
+# Round-off of an energy is taken as this many eps times the magnitudes in it; that of the forces is measured to stay
+# between 0.2 and 1.1 eps * stiffness * |x|, in either dtype, for meshes, materials and stiffnesses of all kinds.
+ENERGY_ROUND_OFF = 4.0
+FORCE_ROUND_OFF = 1.5
+# Share of the projected Hessian tried first where the true one is not definite; tripled until it is one, then
+# shifts are added, each ten times the one before.
+FIRST_SHARE = 0.01
+MAX_BLENDS = 16
+
+
+def topology(scene: Scene) -> Topology:
+    """The structure of a scene, on which the layout of its matrix depends."""
+    return Topology(Key(scene.mesh.elements), Key(scene.fixed), tuple(Key(term.nodes) for term in scene.terms))
+
+
+class State(NamedTuple):
+    """Where Newton's method stands.
+
+    `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so. `step` is the
+    step to take next.
+    """
+
+    x: jax.Array
+    at: Evaluation
+    factor: Any
+    definite: jax.Array
+    step: jax.Array
+    residual: jax.Array
+    steps: jax.Array
+    projected: jax.Array
+    halvings: jax.Array
+    fresh: jax.Array
+    running: jax.Array
+
+
+def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: jax.Array, solver: Newton) -> State:
+    """Newton's method from `x`, for a scene with unlocked indices; to be called inside jit.
+
+    Takes at most `budget` steps. The first `free` of them need not lower the energy, as long as the true
+    Hessian is positive definite. The state it ends in holds the factor of the Hessian at `x`.
+    """
+    rtol = solver.tolerance(x.dtype)
+    zero, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(x)
+    count, yes = jnp.zeros((), jnp.int32), jnp.asarray(True)
+    first = State(
+        x=x,
+        at=Evaluation(zero, zero, nothing, nothing),
+        factor=no_factor(layout, x.dtype, solver),
+        definite=yes,
+        step=nothing,
+        residual=jnp.asarray(jnp.inf, x.dtype),
+        steps=count,
+        projected=count,
+        halvings=count,
+        fresh=yes,
+        running=yes,
+    )
+
+    def body(state: State) -> State:
+        x, at, halvings, moved = line_search(
+            scene, state, state.fresh | (state.definite & (state.steps < free)), solver
+        )
+        hessians = stencil_hessians(scene, x)
+        storage = assemble(layout, hessians)
+        gradient = gather(layout, at.gradient)
+        unbalanced = jnp.max(jnp.abs(gradient))
+        residual = unbalanced / force_scale(layout, storage, x, at, rtol)
+        # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
+        rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
+        taken = (moved & ~state.fresh).astype(jnp.int32)
+        # False for NaN: there is nothing to go on from.
+        wanted = ((residual > rtol) | rough) & (state.steps + taken < budget)
+        factor, definite = solver.linear.factor(layout, storage)
+        factor = convexify(layout, hessians, storage, factor, definite | ~jnp.isfinite(residual), solver)
+        return State(
+            x=x,
+            at=at,
+            factor=factor,
+            definite=definite,
+            step=expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape),
+            residual=residual,
+            steps=state.steps + taken,
+            projected=state.projected + taken * ~state.definite,
+            halvings=state.halvings + halvings,
+            fresh=~yes,
+            running=moved & wanted,
+        )
+
+    return lax.while_loop(lambda state: state.running, body, first)
+
+
+def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:
+    """Zeros in the shape of a factor, to start a loop with."""
+    storage = jax.ShapeDtypeStruct(layout.empty.shape, dtype)
+    factor, _ = jax.eval_shape(solver.linear.factor, layout, storage)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), factor)
+
+
+def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
+    """What an unbalanced force is compared with, `()`.
+
+    The largest sum of magnitudes of the stencil forces at one coordinate, plus what makes `rtol` times the
+    scale no smaller than the round-off of the forces: positions carry a relative error eps, which the
+    stiffness turns into a force of `eps * max |x| * max K_ii` that no iteration can remove.
+    """
+    unknown = layout.slots < layout.position.size
+    stiffness = jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
+    round_off = FORCE_ROUND_OFF * jnp.finfo(x.dtype).eps * stiffness * jnp.max(jnp.abs(x))
+    return jnp.max(at.gradient_scale) + round_off / rtol
+
+
+def convexify(
+    layout: Layout, hessians: list[jax.Array], storage: jax.Array, factor: Any, done: jax.Array, solver: Newton
+) -> Any:
+    """A positive definite factor where the true one failed: the true Hessian blended with the projected one.
+
+    The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along
+    the soft modes of a snap. A projected one that is singular is shifted as well.
+    """
+    stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
+
+    def search(carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+        # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would
+        # be computed in every Newton step, needed or not.
+        (factor, done), stencils = lax.optimization_barrier((carry, hessians))
+        convex = assemble(layout, [project(h) for h in stencils])
+
+        def attempt(carry: Any) -> Any:
+            tries, _, _ = carry
+            count = tries.astype(storage.dtype)
+            share = jnp.minimum(1.0, FIRST_SHARE * 3.0**count)
+            shift = jnp.where(share < 1, 0, stiffness * 10.0 ** (count - 16))
+            blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(shift)
+            factor, done = solver.linear.factor(layout, blend)
+            return tries + 1, factor, done
+
+        begin = (jnp.zeros((), jnp.int32), factor, done)
+        factor = lax.while_loop(lambda c: ~c[2] & (c[0] < MAX_BLENDS), attempt, begin)[1]
+        return factor, jnp.ones_like(done)
+
+    # A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would
+    # always pay.
+    factor, _ = lax.while_loop(lambda c: ~c[1], search, (factor, done))
+    return factor
+
+
+def line_search(
+    scene: Scene, state: State, free: jax.Array, solver: Newton
+) -> tuple[jax.Array, Evaluation, jax.Array, jax.Array]:
+    """Halve the pending step until the energy falls; `(x, evaluation, halvings, moved)`.
+
+    Near the solution differences of energy drown in round-off. There the slope decides: the approximate
+    Wolfe condition of Hager and Zhang (2005), SIAM J. Optim. 16, eq. 4.1, holds for an energy that rises
+    by no more than its round-off. A `free` step is taken at full length; a fresh state has none to take, and
+    is only evaluated.
+    """
+    step = state.step
+    slope = jnp.sum(state.at.gradient * step)
+    # Round-off of the energy: of its sum, and of the positions it is evaluated at.
+    magnitude = state.at.energy_scale + jnp.max(jnp.abs(state.x)) * jnp.sum(state.at.gradient_scale)
+    noise = ENERGY_ROUND_OFF * jnp.finfo(step.dtype).eps * magnitude
+    length = jnp.minimum(1.0, largest_step(scene, state.x, step, solver.keep_volume)).astype(step.dtype)
+    downhill = state.fresh | (jnp.isfinite(slope) & (slope < 0))
+
+    def trial(carry: Any) -> Any:
+        count, _, _, _ = carry
+        t = length * 0.5 ** count.astype(step.dtype)
+        x = state.x + t * step
+        at = evaluate(scene, x)
+        end_slope = jnp.sum(at.gradient * step)
+        falls = at.energy <= state.at.energy + ARMIJO * t * slope
+        flat = (at.energy <= state.at.energy + noise) & (end_slope <= (2 * APPROXIMATE - 1) * slope)
+        finite = jnp.isfinite(at.energy) & jnp.isfinite(end_slope)
+        return count + 1, x, at, state.fresh | ((falls | flat | free) & finite)
+
+    carry = (jnp.zeros((), jnp.int32), state.x, state.at, ~downhill)
+    count, x, at, accepted = lax.while_loop(lambda c: ~c[3] & (c[0] <= MAX_HALVINGS), trial, carry)
+    moved = downhill & accepted
+    keep = lambda new, old: jnp.where(moved, new, old)
+    return keep(x, state.x), jax.tree.map(keep, at, state.at), jnp.maximum(count - 1, 0), moved

@@ -1,0 +1,111 @@
+"""Stability: the lowest modes of the tangent stiffness.
+
+An equilibrium is stable if every eigenvalue of the tangent stiffness, over the free coordinates, is positive.
+The stiffness is that of the nodes, so an eigenvalue (force / length) depends on the mesh; its sign does not,
+nor does the command at which it is zero.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxbeam._tree import Numbers, pytree, unlock
+from jaxbeam.linear import Layout, LinearSolver, assemble, expand
+from jaxbeam.newton import Newton, topology
+from jaxbeam.scene import Scene, stencil_hessians
+
+# Subspace iteration: extra vectors beside the wanted ones, and the most turns it may take.
+GUARD = 4
+MAX_TURNS = 300
+
+
+@pytree
+class Modes:
+    """The lowest modes of a state. `values`: `(count,)` eigenvalues, ascending (force / length). `shapes`:
+    `(count, n, 2)` nodal displacements of unit Euclidean norm, zero where fixed; the largest component is positive.
+    `negative`: `()` how many eigenvalues of the whole stiffness are negative."""
+
+    values: jax.Array
+    shapes: jax.Array
+    negative: jax.Array
+
+
+def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newton()) -> Modes:
+    """The lowest eigenvalues of the tangent stiffness at `x`, and their shapes.
+
+    Args:
+        scene: with its command.
+        x: `(n, 2)` node positions, an equilibrium or not.
+        count: how many modes.
+        solver: its linear solver is used.
+
+    Returns:
+        `Modes`. A first eigenvalue that is negative means that an equilibrium `x` is unstable.
+
+    Raises:
+        ValueError: if `count` is not between 1 and the number of free coordinates, or `x` has another shape.
+    """
+    free = int(np.sum(~scene.fixed))
+    if not isinstance(count, int | np.integer) or not 1 <= count <= free:
+        raise ValueError(f"count: expected a whole number from 1 to {free}, the free coordinates, got {count!r}")
+    if np.shape(x) != scene.mesh.nodes.shape:
+        raise ValueError(f"x: expected node positions of shape {scene.mesh.nodes.shape}, got {np.shape(x)}")
+    layout = solver.linear.layout(topology(scene))
+    return _lowest_mode(unlock(scene), layout, jnp.asarray(x, scene.mesh.nodes.dtype), int(count), solver.linear)
+
+
+@partial(jax.jit, static_argnames=("count", "linear"))
+def _lowest_mode(scene: Scene, layout: Layout, x: jax.Array, count: int, linear: LinearSolver) -> Modes:
+    storage = assemble(layout, stencil_hessians(scene, x))
+    values, vectors = lowest_pairs(layout, storage, count, linear)
+    peak = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors), axis=0)[None], axis=0)
+    shapes = jax.vmap(lambda v: expand(layout, v, x.shape), in_axes=1)(vectors * jnp.sign(peak))
+    return Modes(values, shapes, linear.factor_indefinite(layout, storage)[1])
+
+
+def lowest_pairs(layout: Layout, storage: jax.Array, count: int, linear: LinearSolver) -> tuple[jax.Array, jax.Array]:
+    """Lowest eigenvalues `(count,)` and unit eigenvectors `(N, count)` of an assembled matrix.
+
+    Inverse subspace iteration (Bathe 1973) on the Cholesky factor, of the matrix shifted by as little as makes
+    it positive definite, until the eigenvalues stand still.
+    """
+    stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
+    eps = jnp.finfo(storage.dtype).eps
+
+    def grow(carry: Any) -> Any:
+        tries, _, _, _ = carry
+        # Quarter decades from far below any stiffness that matters.
+        shift = jnp.where(tries > 0, stiffness * eps * 10.0 ** (1 + tries / 4), 0).astype(storage.dtype)
+        factor, done = linear.factor(layout, storage.at[layout.diagonal].add(shift))
+        return tries + 1, shift, factor, done
+
+    first = jax.eval_shape(linear.factor, layout, storage)[0]
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
+    start = (jnp.zeros((), jnp.int32), jnp.zeros((), storage.dtype), blank, jnp.asarray(False))
+    _, shift, factor, _ = lax.while_loop(lambda c: ~c[3] & (c[0] < 80), grow, start)
+    solve = jax.vmap(lambda column: linear.solve(layout, factor, column), in_axes=1, out_axes=1)
+    unknown = (layout.slots < layout.position.size)[:, None]
+
+    def turn(carry: Any) -> Any:
+        turns, old, _, vectors = carry
+        basis, _ = jnp.linalg.qr(vectors)
+        image = jnp.where(unknown, solve(basis), 0)
+        inverse, rotation = jnp.linalg.eigh(0.5 * (basis.T @ image + image.T @ basis))
+        values = 1 / inverse[::-1] - shift
+        moved = jnp.max(jnp.abs(values - old)[:count])
+        return turns + 1, values, moved, (image @ rotation)[:, ::-1]
+
+    width = min(count + GUARD, layout.slots.size)
+    vectors = jnp.where(unknown, jax.random.normal(jax.random.key(0), (layout.slots.size, width), storage.dtype), 0)
+    begin = (jnp.zeros((), jnp.int32), jnp.zeros(width, storage.dtype), jnp.asarray(jnp.inf, storage.dtype), vectors)
+    # Round-off of the factor's entries is eps * stiffness; nothing below it can be told from zero.
+    going = lambda c: (c[0] < MAX_TURNS) & ~(c[2] <= eps * (100 * jnp.abs(c[1][0]) + stiffness))
+    _, values, _, vectors = lax.while_loop(going, turn, begin)
+    vectors = vectors[:, :count]
+    return values[:count], vectors / jnp.linalg.norm(vectors, axis=0)
