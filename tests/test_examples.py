@@ -26,7 +26,11 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(NUMBERS)
 
 
-@pytest.mark.parametrize("name", NUMBERS)
+# Its 150 searches take most of a minute; what it traces is tested in test_branch.py.
+LONG = pytest.param("04_buckling", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", [*(name for name in NUMBERS if name != "04_buckling"), LONG])
 def test_example(name, tmp_path):
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
