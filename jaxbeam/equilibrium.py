@@ -291,8 +291,8 @@ def follow(
 
         following = scene_at(trial)
         at = evaluate(following, x)
-        entry = _choose(over, _broken_off(following, found, x, at, s / target), found)
-        here = jnp.arange(targets.shape[0])
+        entry = _choose(over, _broken_off(following, found, x, at, s / jnp.where(target > 0, target, 1)), found)
+        here = jnp.arange(targets.shape[0], dtype=jnp.int32)
         write = jnp.where(over, here >= walk.leg, landed & (here == walk.leg))
         path = jax.tree.map(lambda all, new: jnp.where(write.reshape(-1, *[1] * new.ndim), new, all), walk.path, entry)
 

@@ -145,7 +145,7 @@ def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: 
             step=expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape),
             residual=residual,
             steps=state.steps + taken,
-            projected=state.projected + taken * ~state.definite,
+            projected=state.projected + jnp.where(state.definite, 0, taken),
             halvings=state.halvings + halvings,
             fresh=~yes,
             running=moved & wanted,

@@ -149,6 +149,7 @@ def test_displacement_patch(F):
     np.testing.assert_allclose(solution.x, moved, rtol=0, atol=1e-9 * 0.24)
 
 
+@pytest.mark.slow
 def test_slender_cantilever():
     """Against Euler and Bernoulli in plane strain, `F L^3 / (3 E' I)`, `E' = E / (1 - nu^2)`, `I = h^3 / 12`.
 
