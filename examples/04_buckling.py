@@ -8,8 +8,8 @@ goes on, stable, to a last fold at 0.37390.
 
 The instability begins at the anchors, where the body is squeezed to half its area: `modes.png` colours the modes by
 how much they strain each element. The critical mode strains the elements beside the anchors, and the free half of the
-beam merely turns with them; the bending mode strains the half between the tendons, and its eigenvalue rises all the
-while.
+beam merely turns with them. It comes down through the other modes as the body is squeezed. The bending mode strains
+the half between the tendons, and its eigenvalue rises, from 1.15 to 2.3, until the local mode meets it.
 
 A figure of -3.4 degrees has been published for one-sided diagonals and both ratios at 0.4. It is no equilibrium.
 Beyond the first fold, at 0.40874, there is none beside the one before: the beam must snap from 0.0 to below
@@ -65,7 +65,7 @@ def trace(scene: jb.Scene, **start: Any) -> jb.Branch:
 
 
 def trace_pair(scene: jb.Scene, fork: jb.Critical) -> list[jb.Branch]:
-    """The two bent branches of a bifurcation, from the bifurcation on."""
+    """The two bent branches of a bifurcation, each from the bifurcation on."""
     traced = []
     for side in (1, -1):
         # A little beyond the bifurcation, pushed off along its mode, lies a state of the branch.
@@ -73,10 +73,26 @@ def trace_pair(scene: jb.Scene, fork: jb.Critical) -> list[jb.Branch]:
         ratios = 1 + s * (np.array(END) - 1)
         beside = jb.equilibrium(jb.command(scene, ratios), fork.x + side * 0.02 * fork.shape, SOLVER)
         jb.check(beside)
-        onward = trace(scene, x0=beside.x, parameter=s, interval=(0.5, 1.0), step=0.01, max_points=80)
-        back = trace(scene, x0=beside.x, parameter=s, direction=-1, interval=(0.5, 1.0), step=0.002, max_points=9)
-        traced += [onward, back]
+        start: dict[str, Any] = {"x0": beside.x, "parameter": s, "interval": (0.5, 1.0)}
+        onward = trace(scene, **start, step=0.01, max_points=80)
+        back = trace(scene, **start, direction=-1, step=0.0006, max_points=60)
+        traced.append(join(scene, fork, back, onward))
     return traced
+
+
+def join(scene: jb.Scene, fork: jb.Critical, back: jb.Branch, onward: jb.Branch) -> jb.Branch:
+    """One branch that begins at the bifurcation: `back` turned round, up to where it reaches it, and `onward`."""
+    angles = np.array([float(tip_angle(scene, jnp.asarray(x))) for x in back.x])
+    count = int(np.argmax(angles * np.sign(angles[0]) < 0)) or len(angles)
+    first = {"parameter": fork.parameter, "ratios": fork.ratios, "x": fork.x, "negative": 1, "residual": 0.0}
+    first["smallest_jacobian"] = float(jb.smallest_jacobian(scene, fork.x))
+    parts: dict[str, Any] = {
+        name: np.concatenate([np.asarray(value)[None], getattr(back, name)[1:count][::-1], getattr(onward, name)])
+        for name, value in first.items()
+    }
+    turned = [dataclasses.replace(c, after=count - 1 - c.after) for c in back.critical if c.after < count - 1]
+    further = [dataclasses.replace(c, after=count + c.after) for c in onward.critical]
+    return dataclasses.replace(onward, **parts, critical=(*turned[::-1], *further))
 
 
 def pull(scene: jb.Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +138,7 @@ def draw_diagram(lopsided: jb.Scene, folded: jb.Branch, pulled: tuple, mirrored:
     figure = Figure(figsize=(7.2, 5.6), layout="constrained")
     axes = figure.subplots(2, 2)
     rows = [
-        (lopsided, [folded], "one-sided", ((0.4145, 0.3990), (-5.6, 1.2))),
+        (lopsided, [folded], "one-sided", ((0.4145, 0.3990), (-5.6, 0.9))),
         (mirrored, fork, "mirrored", ((0.38270, 0.38245), (-1.3, 1.3))),
     ]
     for (whole, close), (scene, traced, name, (across, up)) in zip(axes, rows, strict=True):
@@ -149,41 +165,47 @@ def draw_diagram(lopsided: jb.Scene, folded: jb.Branch, pulled: tuple, mirrored:
 
 
 def draw_modes(scene: jb.Scene, straight: jb.Branch) -> tuple[Figure, np.ndarray]:
-    """The lowest eigenvalues along the straight branch, and two modes on the beam; and the eigenvalues of bending."""
+    """The lowest eigenvalues of the straight beam, and two modes on it; and bending's first and highest eigenvalue.
+
+    Each eigenvalue is coloured by how much of its mode's strain lies beside the anchors. Bending, little strained
+    there, rises; a local mode comes down through the others, meets it and becomes unstable.
+    """
     (fork,) = straight.critical
-    order = np.flatnonzero(straight.ratios[:, 0] < 1)
-    rest = jb.lowest_mode(scene, scene.mesh.nodes, 3, SOLVER)
-    modes = [jb.lowest_mode(jb.command(scene, straight.ratios[k]), straight.x[k], 3, SOLVER) for k in order]
-    values = np.array([m.values for m in modes])
-    alike = np.array([np.abs(np.einsum("knd,nd->k", m.shapes, rest.shapes[0])) for m in modes])
-    ratios = straight.ratios[order, 0]
-    bent = np.argmax(alike, axis=1)
-    bending = np.where(alike.max(axis=1) > 0.98, values[np.arange(len(values)), bent], np.nan)
     centres = np.asarray(scene.mesh.nodes)[scene.mesh.elements].mean(axis=1)
     anchors = np.asarray(scene.mesh.nodes)[scene.terms[1].nodes[:, 1]]
     near = np.linalg.norm(centres[:, None] - anchors, axis=2).min(axis=1) < 0.25
 
-    def share(x: jax.Array, shape: jax.Array) -> float:
-        squares = np.asarray(mode_strain(scene, x, shape)) ** 2
-        return float(squares[near].sum() / squares.sum())
+    @jax.jit
+    def share(x: jax.Array, shape: jax.Array) -> jax.Array:
+        squares = mode_strain(scene, x, shape) ** 2
+        return 100 * jnp.sum(jnp.where(near, squares, 0)) / jnp.sum(squares)
 
-    local = np.array([share(jnp.asarray(straight.x[k]), m.shapes[0]) for k, m in zip(order, modes, strict=True)])
+    keep = (straight.ratios[:, 0] < 1) & (straight.ratios[:, 0] > 0.35)
+    ratios, states = straight.ratios[keep, 0], jnp.asarray(straight.x[keep])
+    modes = [jb.lowest_mode(jb.command(scene, [r, r]), x, 4, SOLVER) for r, x in zip(ratios, states, strict=True)]
+    values = np.array([m.values for m in modes])
+    local = np.array([[share(x, shape) for shape in m.shapes] for x, m in zip(states, modes, strict=True)])
+    rest = jb.lowest_mode(scene, scene.mesh.nodes, 4, SOLVER)
 
-    figure = Figure(figsize=(7.2, 5.4), layout="constrained")
-    grid = figure.add_gridspec(2, 2, height_ratios=(1, 1))
-    curve, spread = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-    curve.plot(ratios, values[:, 0], "-", color="#D55E00", linewidth=1.4, label="lowest mode")
-    curve.plot(ratios, bending, "s", color="#0072B2", markersize=3.5, label="bending, by its shape")
+    figure = Figure(figsize=(7.2, 5.2), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
+    curve = figure.add_subplot(grid[0, :])
+    dots = curve.scatter(
+        np.repeat(ratios, 4), np.ravel(values), c=np.ravel(local), s=11, cmap="viridis", vmin=0, vmax=100, zorder=3
+    )
+    figure.colorbar(dots, ax=curve, label="strain beside the anchors (%)")
     curve.axhline(0, color="0.4", linewidth=0.8)
-    curve.set(ylim=(-10, 10), ylabel="eigenvalue (force / length)")
-    spread.plot(ratios, 100 * local, "-", color="#D55E00", linewidth=1.4, label="lowest mode")
-    spread.set(ylim=(0, 100), ylabel="strain beside the anchors (%)")
-    for ax in (curve, spread):
-        ax.axvline(fork.ratios[0], color="0.4", linewidth=0.8, linestyle=":")
-        ax.set(xlim=(1, 0.3), xlabel="commanded ratio (dimensionless)")
-        ax.grid(color="0.9", linewidth=0.6)
-        ax.spines[["top", "right"]].set_visible(False)
-    curve.legend(frameon=False, fontsize="small", loc="lower left")
+    curve.axvline(fork.ratios[0], color="0.4", linewidth=0.8, linestyle=":")
+    curve.annotate(
+        f"critical, {fork.ratios[0]:.4f}", (fork.ratios[0], 200), (-6, 0), textcoords="offset points", ha="right"
+    )
+    curve.annotate("bending", (0.8, float(rest.values[0])), (0, 7), textcoords="offset points", ha="center")
+    curve.set(xlim=(1.01, 0.355), ylim=(-500, 500), xlabel="commanded ratio of both tendons (dimensionless)")
+    curve.set_yscale("symlog", linthresh=5)
+    curve.set_yticks(ticks := [-100, -10, -5, 0, 5, 10, 100], [str(tick) for tick in ticks])
+    curve.set_ylabel("lowest eigenvalues (force / length)")
+    curve.grid(color="0.9", linewidth=0.6)
+    curve.spines[["top", "right"]].set_visible(False)
     pictures = [
         (scene.mesh.nodes, rest.shapes[0], f"bending at rest, {float(rest.values[0]):.2f}"),
         (fork.x, fork.shape, f"critical mode at {fork.ratios[0]:.4f}, 0.00"),
@@ -194,7 +216,8 @@ def draw_modes(scene: jb.Scene, straight: jb.Branch) -> tuple[Figure, np.ndarray
         ax = figure.add_subplot(grid[1, column])
         plot.field(scene, moved, mode_strain(scene, x, shape), "strain of the mode", ax=ax, bounds=bounds)
         ax.set_title(title, fontsize="medium")
-    return figure, bending[~np.isnan(bending)]
+    highest = np.argmax(values[ratios > fork.ratios[0], 0])
+    return figure, np.array([values[0, 0], values[highest, 0], ratios[highest]])
 
 
 def main(out: Path) -> dict[str, float]:
@@ -202,9 +225,9 @@ def main(out: Path) -> dict[str, float]:
     out.mkdir(parents=True, exist_ok=True)
     lopsided, mirrored = jb.tendon_beam(), jb.tendon_beam(diagonals="mirrored")
     print("tracing the beam with one-sided diagonals (the first time compiles) ...", flush=True)
-    folded = trace(lopsided, max_points=95)
+    folded = trace(lopsided, step=0.008, max_points=240)
     print("tracing the beam with mirrored diagonals ...", flush=True)
-    straight = trace(mirrored)
+    straight = trace(mirrored, step=0.01)
     (fork,) = straight.critical
     pair = trace_pair(mirrored, fork)
 
@@ -237,7 +260,7 @@ def main(out: Path) -> dict[str, float]:
     print("drawing modes.png ...", flush=True)
     figure, bending = draw_modes(mirrored, straight)
     figure.savefig(out / "modes.png", dpi=200)
-    print(f"bending eigenvalue: {bending[0]:.3f} at first, {bending[-1]:.3f} at last")
+    print(f"bending eigenvalue: {bending[0]:.3f} at first, {bending[1]:.3f} at ratio {bending[2]:.3f}, its highest")
     print("drawing equilibria.png ...", flush=True)
     titles = [f"{float(tip_angle(lopsided, s.x)):+.2f}°, energy {float(s.energy):.1f}" for s, _, _ in found]
     states = plot.States(lopsided, np.tile(GOAL, (len(found), 1)), np.stack([s.x for s, _, _ in found]))

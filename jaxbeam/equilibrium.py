@@ -54,8 +54,9 @@ REMEDIES = {
     "or a material that resists it, such as neo_hookean",
     Status.UNSTABLE: "the equilibrium is a saddle, which a real beam leaves: set Newton(escape=True), or start from "
     "x0 = x + a little of lowest_mode(scene, x)",
-    Status.INACCURATE: "forces balance to round-off, but positions are uncertain by more than a thousandth of "
-    "the body (see correction): use float64",
+    Status.INACCURATE: "forces balance to round-off, but that leaves positions uncertain by more than a thousandth of "
+    "the body (see correction), or whether the equilibrium is stable: use float64; in float64 the command is at a "
+    "limit of stability, see lowest_mode",
     Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
     "(-1, 0.5), all finite): build the scene outside jit to be told which",
 }
@@ -268,7 +269,7 @@ def follow(
         valid = is_valid(scene_at(target))
         found = replace(found, status=found.status | jnp.where(valid, 0, jnp.int32(Status.INVALID)))
         converged = (found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
-        saddle = converged & ~state.definite & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
+        saddle = converged & ~state.definite & ~state.marginal & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
         spent_out = (found.steps >= solver.max_steps) | (found.attempts >= MAX_ATTEMPTS) | ~valid
         may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > walk.s) & ~spent_out
         # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
@@ -339,8 +340,8 @@ def _report(scene: Scene, state: State, solver: Newton) -> Solution:
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
         Status.INVERTED: ~(volume > 0),
-        Status.UNSTABLE: converged & ~state.definite,
-        Status.INACCURATE: converged & state.definite & (correction > INACCURATE),
+        Status.UNSTABLE: converged & ~state.definite & ~state.marginal,
+        Status.INACCURATE: converged & (state.marginal | (state.definite & (correction > INACCURATE))),
     }
     return Solution(
         x=state.x,

@@ -81,14 +81,15 @@ def topology(scene: Scene) -> Topology:
 class State(NamedTuple):
     """Where Newton's method stands.
 
-    `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so. `step` is the
-    step to take next.
+    `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so; `marginal` if a
+    shift by no more than round-off did it, which leaves its sign open. `step` is the step to take next.
     """
 
     x: jax.Array
     at: Evaluation
     factor: Any
     definite: jax.Array
+    marginal: jax.Array
     step: jax.Array
     residual: jax.Array
     steps: jax.Array
@@ -112,6 +113,7 @@ def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: 
         at=Evaluation(zero, zero, nothing, nothing),
         factor=no_factor(layout, x.dtype, solver),
         definite=yes,
+        marginal=~yes,
         step=nothing,
         residual=jnp.asarray(jnp.inf, x.dtype),
         steps=count,
@@ -136,12 +138,13 @@ def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: 
         # False for NaN: there is nothing to go on from.
         wanted = ((residual > rtol) | rough) & (state.steps + taken < budget)
         factor, definite = solver.linear.factor(layout, storage)
-        factor = convexify(layout, hessians, storage, factor, definite | ~jnp.isfinite(residual), solver)
+        factor, marginal = convexify(layout, hessians, storage, factor, definite | ~jnp.isfinite(residual), solver)
         return State(
             x=x,
             at=at,
             factor=factor,
             definite=definite,
+            marginal=marginal,
             step=expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape),
             residual=residual,
             steps=state.steps + taken,
@@ -176,37 +179,40 @@ def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation
 
 def convexify(
     layout: Layout, hessians: list[jax.Array], storage: jax.Array, factor: Any, done: jax.Array, solver: Newton
-) -> Any:
+) -> tuple[Any, jax.Array]:
     """A positive definite factor where the true one failed: the true Hessian blended with the projected one.
 
     The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along
-    the soft modes of a snap. A projected one that is singular is shifted as well.
+    the soft modes of a snap. A projected one that is singular is shifted as well. Returned with it is whether
+    the true Hessian had one after a shift by its own round-off, which is tried first.
     """
     stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
+    round_off = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5 * stiffness
+    no = jnp.zeros_like(done)
 
-    def search(carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+    def search(carry: tuple[Any, jax.Array, jax.Array]) -> tuple[Any, jax.Array, jax.Array]:
         # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would
         # be computed in every Newton step, needed or not.
-        (factor, done), stencils = lax.optimization_barrier((carry, hessians))
+        (factor, done, _), stencils = lax.optimization_barrier((carry, hessians))
         convex = assemble(layout, [project(h) for h in stencils])
 
         def attempt(carry: Any) -> Any:
             tries, _, _ = carry
             count = tries.astype(storage.dtype)
-            share = jnp.minimum(1.0, FIRST_SHARE * 3.0**count)
-            shift = jnp.where(share < 1, 0, stiffness * 10.0 ** (count - 16))
+            share = jnp.where(tries > 0, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 1)), 0.0)
+            shift = jnp.where(share < 1, jnp.where(tries > 0, 0, round_off), stiffness * 10.0 ** (count - 17))
             blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(shift)
             factor, done = solver.linear.factor(layout, blend)
             return tries + 1, factor, done
 
         begin = (jnp.zeros((), jnp.int32), factor, done)
-        factor = lax.while_loop(lambda c: ~c[2] & (c[0] < MAX_BLENDS), attempt, begin)[1]
-        return factor, jnp.ones_like(done)
+        tries, factor, found = lax.while_loop(lambda c: ~c[2] & (c[0] <= MAX_BLENDS), attempt, begin)
+        return factor, jnp.ones_like(done), found & (tries == 1)
 
     # A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would
     # always pay.
-    factor, _ = lax.while_loop(lambda c: ~c[1], search, (factor, done))
-    return factor
+    factor, _, marginal = lax.while_loop(lambda c: ~c[1], search, (factor, done, no))
+    return factor, marginal
 
 
 def line_search(

@@ -1,5 +1,12 @@
 """Settings and scenes that the tests share. Each new scene shape compiles for seconds, so few shapes are used."""
 
+import os
+from pathlib import Path
+
+# Before JAX is imported: both processes of the tests, and the scripts they start, compile each program once.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
 import jax
 import pytest
 

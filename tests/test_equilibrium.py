@@ -299,6 +299,41 @@ def test_taut_springs_are_stable():
     assert np.isinf(solution.smallest_jacobian)  # no solid, so nothing is inverted
 
 
+def test_limit_of_stability_is_inaccurate():
+    """At their natural length the springs hold the midpoint along the line and not across: no sign can be told."""
+    solution = jb.equilibrium(spring_pair(1.0))
+    assert int(solution.status) == jb.Status.INACCURATE
+    assert abs(float(jb.lowest_mode(spring_pair(1.0), solution.x).values[0])) < 1e-15
+    with pytest.raises(jb.EquilibriumError, match=r"INACCURATE: .* whether the equilibrium is stable: use float64"):
+        jb.check(solution)
+    for ratio in (1 - 1e-9, 1 + 1e-9):
+        assert not int(jb.equilibrium(spring_pair(ratio), solver=STAY).status) & jb.Status.INACCURATE
+
+
+def test_softer_than_round_off_is_inaccurate():
+    """A slender beam in float32: the forces balance to the last bit, and positions are still not known."""
+    thin = lambda dtype: jb.tendon_beam(5, 3, height=1e-3, tendon_modulus=2.0, dtype=dtype)
+    single, double = (jb.equilibrium(jb.command(thin(dtype), [0.7, 1.0])) for dtype in (jnp.float32, jnp.float64))
+    assert int(single.status) == jb.Status.INACCURATE
+    assert single.residual <= single.tolerance
+    assert np.abs(np.asarray(single.x) - np.asarray(jb.check(double).x)).max() > 1e-3
+
+
+@pytest.mark.parametrize("load", [0.0, 1e-3])
+def test_traced_scene_that_is_not_held_is_flagged(load):
+    """Concrete, it is refused before any solve; traced, its rigid motions leave the stability open."""
+    mesh = jb.rectangle(2.0, 1.0, 5, 3)
+
+    def status(nodes):
+        loose = jb.Mesh(nodes, mesh.elements)
+        terms = (jb.solid(loose, jb.lame(1.0, 0.3)), jb.dead_load(loose, [14], [load, 0.0]))
+        return jb.equilibrium(jb.Scene(loose, terms, np.zeros((15, 2), bool))).status
+
+    assert int(jax.jit(status)(mesh.nodes)) & (jb.Status.INACCURATE | jb.Status.NOT_CONVERGED)
+    with pytest.raises(ValueError, match="fixed: the body is not held"):
+        status(mesh.nodes)
+
+
 def triangle(density, load=None):
     """One triangle, its base clamped, its apex free."""
     mesh = jb.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
@@ -344,8 +379,9 @@ def test_poisoned_parameter_is_nonfinite(steered):
     solution = jb.equilibrium(scene)
     assert int(solution.status) == jb.Status.NONFINITE | jb.Status.NOT_CONVERGED | jb.Status.INVALID
     np.testing.assert_array_equal(solution.x, scene.mesh.nodes)
-    with pytest.raises(jb.EquilibriumError, match=r"INVALID: .* a parameter is out of its range"):
-        jb.check(solution)
+    for message in (r"INVALID: .* a parameter is out of its range", "NONFINITE: .* energy or forces are not finite"):
+        with pytest.raises(jb.EquilibriumError, match=message):
+            jb.check(solution)
 
 
 def out_of_range_commands():
