@@ -20,7 +20,7 @@ from jax import lax
 from jaxbeam._tree import Numbers, is_concrete, pytree, replace, unlock
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout, expand, gather
-from jaxbeam.newton import Newton, State, newton, no_factor, topology
+from jaxbeam.newton import INACCURATE, Newton, State, correction, newton, no_factor, topology
 from jaxbeam.scene import (
     Evaluation,
     Scene,
@@ -325,30 +325,26 @@ def follow(
     return lax.while_loop(lambda walk: walk.running, attempt, walk).path
 
 
-# A correction, over the size of the body, that makes an answer inaccurate.
-INACCURATE = 1e-3
-
-
 def _report(scene: Scene, state: State, solver: Newton) -> Solution:
     """The `Solution` of one attempt."""
     rtol = solver.tolerance(state.x.dtype)
     converged = state.residual <= rtol
     finite = jnp.isfinite(state.at.energy) & jnp.all(jnp.isfinite(state.at.gradient))
     volume, element = worst_element(scene, state.x)
-    correction = jnp.max(jnp.abs(state.step)) / jnp.max(jnp.abs(state.x))
+    left = correction(state.x, state.step)
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
         Status.INVERTED: ~(volume > 0),
         Status.UNSTABLE: converged & ~state.definite & ~state.marginal,
-        Status.INACCURATE: converged & (state.marginal | (state.definite & (correction > INACCURATE))),
+        Status.INACCURATE: converged & (state.marginal | (state.definite & (left > INACCURATE))),
     }
     return Solution(
         x=state.x,
         energy=state.at.energy,
         residual=state.residual,
         tolerance=jnp.full((), rtol, state.x.dtype),
-        correction=correction,
+        correction=left,
         steps=state.steps,
         projected=state.projected,
         halvings=state.halvings,

@@ -72,6 +72,10 @@ FORCE_ROUND_OFF = 1.5
 FIRST_SHARE = 0.01
 MAX_BLENDS = 16
 
+# A correction that makes an answer inaccurate, and how many steps are spent on a smaller one.
+INACCURATE = 1e-3
+POLISH = 10
+
 
 def topology(scene: Scene) -> Topology:
     """The structure of a scene, on which the layout of its matrix depends."""
@@ -95,6 +99,7 @@ class State(NamedTuple):
     steps: jax.Array
     projected: jax.Array
     halvings: jax.Array
+    polished: jax.Array
     fresh: jax.Array
     running: jax.Array
 
@@ -119,6 +124,7 @@ def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: 
         steps=count,
         projected=count,
         halvings=count,
+        polished=count,
         fresh=yes,
         running=yes,
     )
@@ -135,26 +141,36 @@ def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: 
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
         rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
         taken = (moved & ~state.fresh).astype(jnp.int32)
-        # False for NaN: there is nothing to go on from.
-        wanted = ((residual > rtol) | rough) & (state.steps + taken < budget)
         factor, definite = solver.linear.factor(layout, storage)
         factor, marginal = convexify(layout, hessians, storage, factor, definite | ~jnp.isfinite(residual), solver)
+        step = expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape)
+        # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
+        # mode, and it rounds anew with each step.
+        vague = (residual <= rtol) & (correction(x, step) > INACCURATE) & (state.polished < POLISH)
+        # False for NaN: there is nothing to go on from.
+        wanted = ((residual > rtol) | rough | vague) & (state.steps + taken < budget)
         return State(
             x=x,
             at=at,
             factor=factor,
             definite=definite,
             marginal=marginal,
-            step=expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape),
+            step=step,
             residual=residual,
             steps=state.steps + taken,
             projected=state.projected + jnp.where(state.definite, 0, taken),
             halvings=state.halvings + halvings,
+            polished=state.polished + vague.astype(jnp.int32),
             fresh=~yes,
             running=moved & wanted,
         )
 
     return lax.while_loop(lambda state: state.running, body, first)
+
+
+def correction(x: jax.Array, step: jax.Array) -> jax.Array:
+    """How far a step moves any node, over the size of the body."""
+    return jnp.max(jnp.abs(step)) / jnp.max(jnp.abs(x))
 
 
 def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:
