@@ -103,7 +103,7 @@ def groups() -> list[Group]:
         (15, 5, "mirrored", (mm, nh, svk), ("inverse-square",), two, 60),
         (15, 5, "crossed", (mm,), ("inverse-square",), two, 40),
         (29, 7, "one-sided", (mm, nh), ("inverse-square",), two, 70),
-        (29, 7, "mirrored", (svk, linear), ("inverse-square",), one, 40),
+        (29, 7, "mirrored", (svk, linear), ("inverse-square",), one, 16),
         (29, 7, "crossed", (nh,), ("inverse-square",), one, 30),
         (57, 13, "one-sided", (mm, nh), ("inverse-square",), two, 10),
         (113, 25, "one-sided", (mm, nh), ("inverse-square",), one, 4),
