@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Numbers, is_concrete, unlock
-from jaxbeam.equilibrium import Solution, _equilibrium, follow
+from jaxbeam.equilibrium import Solution, _equilibrium, differentiable, follow
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout
 from jaxbeam.newton import Newton, topology
@@ -56,14 +56,19 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     """
     check_held(scene)
     command(scene, ratios)  # checks the ratios
-    end = commands(jnp.asarray(ratios, scene.mesh.nodes.dtype), steps)[-1]
-    return _ramp(unlock(scene), solver.linear.layout(topology(scene)), end, steps, solver)
+    way = commands(jnp.asarray(ratios, scene.mesh.nodes.dtype), steps)
+    end = way[-1]
+    layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
+    path = _ramp(*lax.stop_gradient((open_scene, layout, end)), steps, solver)
+    if is_concrete(end, *jax.tree.leaves(scene)):
+        return path
+    return _differentiable_rows(open_scene, layout, way, path, solver)
 
 
 @partial(jax.jit, static_argnames=("steps", "solver"))
 def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
     targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
-    return follow(lambda s: command(scene, (1 - s) + s * end), layout, scene.mesh.nodes, targets, solver)
+    return follow(lambda s: command(scene, (1 - s) + s * end), layout, scene.mesh.nodes, targets, solver)[0]
 
 
 def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
@@ -91,9 +96,28 @@ def sweep(scene: Scene, ratios: Numbers, solver: Newton = Newton()) -> Solution:
     check_held(scene)
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
     rows = jnp.asarray(ratios, scene.mesh.nodes.dtype)
-    return _sweep(unlock(scene), solver.linear.layout(topology(scene)), rows, solver)
+    layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
+    batch = _sweep(*lax.stop_gradient((open_scene, layout, rows)), solver)
+    if is_concrete(rows, *jax.tree.leaves(scene)):
+        return batch
+    return _differentiable_rows(open_scene, layout, rows, batch, solver)
 
 
 @partial(jax.jit, static_argnames="solver")
 def _sweep(scene: Scene, layout: Layout, rows: jax.Array, solver: Newton) -> Solution:
-    return lax.map(lambda ratios: _equilibrium(command(scene, ratios), layout, scene.mesh.nodes, solver), rows)
+    return lax.map(lambda ratios: _equilibrium(command(scene, ratios), layout, scene.mesh.nodes, solver)[0], rows)
+
+
+@partial(jax.jit, static_argnames="solver")
+def _differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: Solution, solver: Newton) -> Solution:
+    """Solutions `(B, ...)` of the commands `rows` `(B, m)` as functions of these and of the scene.
+
+    Factors are not kept, they would outgrow any memory: one is made anew for each row that is differentiated.
+    """
+
+    @jax.checkpoint
+    def one(row_and_solution: tuple[jax.Array, Solution]) -> Solution:
+        ratios, solution = row_and_solution
+        return differentiable(command(scene, ratios), layout, solution, None, solver)
+
+    return lax.map(one, (rows, found))

@@ -19,16 +19,19 @@ from jax import lax
 
 from jaxbeam._tree import Numbers, is_concrete, pytree, replace, unlock
 from jaxbeam.held import check_held
+from jaxbeam.implicit import follow_scene
 from jaxbeam.linear import Layout, expand, gather
 from jaxbeam.newton import INACCURATE, Newton, State, correction, newton, no_factor, topology
 from jaxbeam.scene import (
     Evaluation,
     Scene,
+    energy,
     evaluate,
     is_valid,
     largest_step,
     partway,
     ratios_of,
+    smallest_jacobian,
     worst_element,
 )
 
@@ -56,7 +59,7 @@ REMEDIES = {
     "x0 = x + a little of lowest_mode(scene, x)",
     Status.INACCURATE: "forces balance to round-off, but that leaves positions uncertain by more than a thousandth of "
     "the body (see correction), or whether the equilibrium is stable: use float64; in float64 the command is at a "
-    "limit of stability, see lowest_mode",
+    "limit of stability, such as a fold, where no derivative exists: see lowest_mode",
     Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
     "(-1, 0.5), all finite): build the scene outside jit to be told which",
 }
@@ -110,6 +113,10 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
     Newton's method starts at `x0`. If it fails, the actuation is approached from rest in steps as small as it
     takes; if it ends on a saddle, it leaves for the stable state beside it (unless `solver.escape` is false).
 
+    `x`, `energy`, `smallest_jacobian` and `ratios` are differentiable in every float of the scene, forward, reverse
+    and to any order, by one back-substitution (see `jaxbeam.implicit`); not in `x0`. The derivative is NaN where the
+    status is not `OK`, and does not exist at a fold.
+
     Args:
         scene: what to solve.
         x0: `(n, 2)` start; by default the rest positions. Fixed coordinates are put at rest.
@@ -124,13 +131,26 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
     """
     check_held(scene)
     layout = solver.linear.layout(topology(scene))
-    return _equilibrium(unlock(scene), layout, start(scene, x0), solver)
+    open_scene = unlock(scene)
+    solution, factor = _equilibrium(*lax.stop_gradient((open_scene, layout, start(scene, x0))), solver)
+    if is_concrete(*jax.tree.leaves(scene)):
+        return solution
+    return differentiable(open_scene, layout, solution, factor, solver)
 
 
 @partial(jax.jit, static_argnames="solver")
-def _equilibrium(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> Solution:
-    path = follow(lambda s: partway(scene, s), layout, x, jnp.ones(1, x.dtype), solver)
-    return jax.tree.map(lambda leaf: leaf[0], path)
+def _equilibrium(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> tuple[Solution, Any]:
+    path, factor = follow(lambda s: partway(scene, s), layout, x, jnp.ones(1, x.dtype), solver)
+    return jax.tree.map(lambda leaf: leaf[0], path), factor
+
+
+@partial(jax.jit, static_argnames="solver")
+def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any, solver: Newton) -> Solution:
+    """The solution as a function of the scene: `x`, `energy`, `smallest_jacobian` and `ratios` move with it."""
+    x = follow_scene(solver.linear, scene, layout, solution.x, factor, solution.status == 0)
+    return replace(
+        solution, x=x, energy=energy(scene, x), smallest_jacobian=smallest_jacobian(scene, x), ratios=ratios_of(scene)
+    )
 
 
 def check(solution: Solution) -> Solution:
@@ -242,13 +262,13 @@ class Walk(NamedTuple):
 
 def follow(
     scene_at: Callable[[jax.Array], Scene], layout: Layout, x: jax.Array, targets: jax.Array, solver: Newton
-) -> Solution:
+) -> tuple[Solution, Any]:
     """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
 
     The first attempt goes from `x` straight to the first target. One that fails is made in smaller steps, from
     the last good state (at first: the rest positions at `s = 0`), along the tangent of the branch; steps
     grow again while they succeed. When they have become too small the walk ends: what remains is reported
-    `NOT_CONVERGED`, at the last good state.
+    `NOT_CONVERGED`, at the last good state. Returned with them is the factor of the stiffness at the last.
     """
     count = jnp.zeros((), jnp.int32)
     rest = scene_at(targets[0])
@@ -322,7 +342,8 @@ def follow(
             running=~over & ~(landed & (walk.leg == targets.shape[0] - 1)),
         )
 
-    return lax.while_loop(lambda walk: walk.running, attempt, walk).path
+    walk = lax.while_loop(lambda walk: walk.running, attempt, walk)
+    return walk.path, walk.factor
 
 
 def _report(scene: Scene, state: State, solver: Newton) -> Solution:

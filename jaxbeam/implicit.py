@@ -1,0 +1,68 @@
+"""The derivative through equilibrium: how a solution moves when the scene changes.
+
+At equilibrium the unbalanced forces vanish, `g(scene, x) = 0` on the free coordinates, so
+
+    K dx = -dg        K = dg/dx, the true (unprojected) tangent stiffness,
+
+by the implicit function theorem: one back-substitution with a factor of `K`. The solve itself is not
+differentiated, and where it started does not matter. Both sides of the equation are written as functions of the
+scene and of `x`, so JAX can differentiate them again: forward, reverse and to any order.
+
+The derivative exists where `K` is not singular, which a stable solution guarantees and a fold denies. Where the
+status of the solution is not `OK` it is NaN: not zero, which would pass for an answer. A member of a batch that
+the loss does not look at (its cotangent is exactly zero) harms no other.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
+from jaxbeam.scene import Scene, energy, stencil_hessians
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def follow_scene(
+    linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
+) -> jax.Array:
+    """`x` `(n, 2)` itself, which moves with the scene as its equilibrium does.
+
+    Args:
+        linear: the linear solver.
+        scene: with unlocked indices; differentiable in all its floats.
+        layout: of its matrix.
+        x: an equilibrium of the scene. Its own tangent is ignored.
+        factor: of the true stiffness at `x`; None to make one if it is asked for.
+        trusted: `()` whether `x` is an equilibrium with a definite stiffness.
+    """
+    return x
+
+
+@follow_scene.defjvp
+def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    scene, layout, found, factor, trusted = primals
+    scene_dot = tangents[0]
+    x = follow_scene(linear, *primals)
+    if factor is None:
+        factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(*lax.stop_gradient((scene, found)))))
+    factor = lax.stop_gradient(factor)
+    slope = jax.grad(energy, argnums=1)
+
+    def product(v: jax.Array) -> jax.Array:
+        """The stiffness times a vector of unknowns."""
+        return gather(layout, jax.jvp(lambda y: slope(scene, y), (x,), (expand(layout, v, x.shape),))[1])
+
+    def solve(_: Any, b: jax.Array) -> jax.Array:
+        y = linear.solve(layout, factor, b)
+        return jnp.where(trusted, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(y.dtype))
+
+    # Fixed coordinates are at rest, and move with the rest positions.
+    carried = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
+    pull = jax.jvp(slope, (scene, x), (scene_dot, carried))[1]
+    moved = lax.custom_linear_solve(product, -gather(layout, pull), solve, symmetric=True)
+    return x, expand(layout, moved, x.shape) + carried
