@@ -1,6 +1,6 @@
 """jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
 
-Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> measures. Pictures are in
+Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> measures -> design. Pictures are in
 `jaxbeam.plot`, which is imported by itself because it needs matplotlib.
 """
 
@@ -10,6 +10,12 @@ from jaxbeam.actuation import sweep as sweep
 from jaxbeam.branch import Branch as Branch
 from jaxbeam.branch import Critical as Critical
 from jaxbeam.branch import trace_branch as trace_branch
+from jaxbeam.design import Design as Design
+from jaxbeam.design import DesignStatus as DesignStatus
+from jaxbeam.design import History as History
+from jaxbeam.design import minimise as minimise
+from jaxbeam.design import reach as reach
+from jaxbeam.design import reach_each as reach_each
 from jaxbeam.equilibrium import EquilibriumError as EquilibriumError
 from jaxbeam.equilibrium import Solution as Solution
 from jaxbeam.equilibrium import Status as Status

@@ -261,13 +261,18 @@ class Walk(NamedTuple):
 
 
 def follow(
-    scene_at: Callable[[jax.Array], Scene], layout: Layout, x: jax.Array, targets: jax.Array, solver: Newton
+    scene_at: Callable[[jax.Array], Scene],
+    layout: Layout,
+    x: jax.Array,
+    targets: jax.Array,
+    solver: Newton,
+    origin: jax.Array | None = None,
 ) -> tuple[Solution, Any]:
     """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
 
     The first attempt goes from `x` straight to the first target. One that fails is made in smaller steps, from
-    the last good state (at first: the rest positions at `s = 0`), along the tangent of the branch; steps
-    grow again while they succeed. When they have become too small the walk ends: what remains is reported
+    the last good state (at first: `origin` at `s = 0`, by default the rest positions), along the tangent of the
+    branch; steps grow again while they succeed. When they have become too small the walk ends: what remains is reported
     `NOT_CONVERGED`, at the last good state. Returned with them is the factor of the stiffness at the last.
     """
     count = jnp.zeros((), jnp.int32)
@@ -278,7 +283,8 @@ def follow(
     zero, no = jnp.zeros((), x.dtype), jnp.asarray(False)
     noise = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape), x.dtype)
     factor = no_factor(layout, x.dtype, solver)
-    walk = Walk(count, zero, rest.mesh.nodes, factor, no, targets[0], x, targets[0], count, count, empty, path, ~no)
+    origin = rest.mesh.nodes if origin is None else origin
+    walk = Walk(count, zero, origin, factor, no, targets[0], x, targets[0], count, count, empty, path, ~no)
 
     def attempt(walk: Walk) -> Walk:
         scene = scene_at(walk.trial)

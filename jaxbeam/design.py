@@ -1,0 +1,352 @@
+"""Inverse design: the commands that make a measure of the equilibrium what it should be.
+
+`reach` is for commands: of all that reach a target it finds the one of least effort. `minimise` is for anything
+else: any loss of any scene that is a function of parameters, by any optax optimiser.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+
+from jaxbeam._tree import Numbers, is_concrete, pytree, replace
+from jaxbeam.equilibrium import Solution, equilibrium
+from jaxbeam.held import check_held
+from jaxbeam.measures import tip_angle
+from jaxbeam.newton import Newton, topology
+from jaxbeam.scene import Scene, tendon_terms
+from jaxbeam.search import History, Measure, Problem, Stand, search
+
+
+class DesignStatus(enum.IntEnum):
+    """How a design ended."""
+
+    REACHED = 0
+    UNREACHABLE = 1
+    NOT_CONVERGED = 2
+
+
+@pytree
+class Design:
+    """What a design found.
+
+    theta: the parameters: for `reach` `(m,)` commanded ratios.
+    solution: their equilibrium.
+    value: the measure there; for `minimise` the loss.
+    loss: `()` distance from the target, Euclidean; for `minimise` the loss.
+    held: `(m,)` -1 where the lower bound holds a command back, 1 where the upper does, else 0.
+    solves: `()` equilibria solved.
+    history: of all of them.
+    status: `()` int32 of a `DesignStatus`.
+    """
+
+    theta: Any
+    solution: Solution
+    value: jax.Array
+    loss: jax.Array
+    held: jax.Array
+    solves: jax.Array
+    history: History
+    status: jax.Array
+
+
+# ------------------------------------------------------------------------------------------------ reach
+
+
+def reach(
+    scene: Scene,
+    target: Numbers,
+    measure: Measure = tip_angle,
+    *,
+    bounds: tuple[Numbers, Numbers] = (0.4, 1.0),
+    starts: Numbers | None = None,
+    tolerance: float | None = None,
+    max_solves: int = 40,
+    solver: Newton = Newton(),
+) -> Design:
+    """Commands within `bounds` at which `measure` of the equilibrium is `target`.
+
+    Of all that reach it, the one of least effort `sum (1 - ratio)^2`; if none does, the one nearest to it. Found by
+    sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact first and second derivatives: each
+    step is a small quadratic program in the commands. The search is local: where a target is reached in several
+    ways, or on several branches, give several `starts`, and the best answer is taken.
+
+    Args:
+        scene: with `m` tendons.
+        target: `()` or `(p,)`, what the measure should be.
+        measure: `(scene, x)` to `()` or `(p,)`, such as `tip_angle` (degrees), `tip_position` (length), or a
+            function of your own at module level. Components are weighed as they are: scale those of different units.
+        bounds: lowest and highest ratio, each `()` or `(m,)`.
+        starts: `(S, m)` commands to start from; by default ratio 1, at rest.
+        tolerance: largest deviation from the target that counts as reached, in its unit: by default 1e-8, in
+            float32 1e-3.
+        max_solves: equilibria to solve at most, from each start.
+        solver: settings of each solve.
+
+    Returns:
+        A `Design` of status `REACHED`, or `UNREACHABLE`: then `value` is the nearest that was found, and `held` says
+        which bounds are in the way, or `NOT_CONVERGED`.
+
+    Raises:
+        ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
+    """
+    problem, begin = _problem(scene, bounds, starts, tolerance, solver)
+    shape = _shape(measure, scene)
+    if np.shape(target) != shape:
+        raise ValueError(f"target: expected the shape {shape} of the measure, got {np.shape(target)}")
+    return _reach(problem, jnp.asarray(target, scene.mesh.nodes.dtype), begin, measure, max_solves, solver)
+
+
+def reach_each(
+    scene: Scene,
+    targets: Numbers,
+    measure: Measure = tip_angle,
+    *,
+    bounds: tuple[Numbers, Numbers] = (0.4, 1.0),
+    starts: Numbers | None = None,
+    tolerance: float | None = None,
+    max_solves: int = 40,
+    solver: Newton = Newton(),
+) -> Design:
+    """Commands for each of a sequence of targets `(T,)` or `(T, p)`, each started from the answer before.
+
+    So a tip draws a path, in one `lax.scan`: neighbouring targets take few solves each. The first is found as by
+    `reach`. Arguments, errors and answer are those of `reach`, with leading axis `T`.
+    """
+    problem, begin = _problem(scene, bounds, starts, tolerance, solver)
+    shape = _shape(measure, scene)
+    if np.ndim(targets) != len(shape) + 1 or np.shape(targets)[1:] != shape or not np.shape(targets)[0]:
+        raise ValueError(f"targets: expected shape (T, *{shape}), a row for each target, got {np.shape(targets)}")
+    return _reach_each(problem, jnp.asarray(targets, scene.mesh.nodes.dtype), begin, measure, max_solves, solver)
+
+
+def _problem(
+    scene: Scene, bounds: tuple[Numbers, Numbers], starts: Numbers | None, tolerance: float | None, solver: Newton
+) -> tuple[Problem, jax.Array]:
+    """The checked problem, and the commands `(S, m)` to start from."""
+    check_held(scene)
+    dtype = scene.mesh.nodes.dtype
+    count = sum(term.nodes.shape[0] for term in tendon_terms(scene))
+    if not count:
+        raise ValueError("scene: expected at least one tendon to command, got none")
+    if tolerance is None:
+        tolerance = 1e-8 if jnp.finfo(dtype).eps < 1e-10 else 1e-3
+    if not tolerance > 0:
+        raise ValueError(f"tolerance: expected a positive number, got {tolerance!r}")
+    ends = []
+    for name, bound in zip(("low", "high"), bounds, strict=True):
+        if np.shape(bound) not in ((), (count,)):
+            raise ValueError(f"bounds: expected {name} of shape () or ({count},), got {np.shape(bound)}")
+        ends.append(jnp.broadcast_to(jnp.asarray(bound, dtype), (count,)))
+    low, high = ends
+    if is_concrete(low, high) and not ((np.asarray(low) > 0) & (np.asarray(low) <= np.asarray(high))).all():
+        raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
+    begin = jnp.ones((1, count), dtype) if starts is None else jnp.asarray(starts, dtype)
+    if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
+        raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
+    problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
+    return problem, jnp.clip(begin, low, high)
+
+
+def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
+    """The shape of a measure's value, checked."""
+    shape = jax.eval_shape(measure, scene, scene.mesh.nodes).shape
+    if len(shape) > 1:
+        raise ValueError(f"measure: expected a function (scene, x) to shape () or (p,), got shape {shape}")
+    return shape
+
+
+@partial(jax.jit, static_argnames=("measure", "max_solves", "solver"))
+def _reach(
+    problem: Problem, target: jax.Array, begin: jax.Array, measure: Measure, max_solves: int, solver: Newton
+) -> Design:
+    rest, ones = problem.scene.mesh.nodes, jnp.ones_like(problem.low)
+
+    def once(theta: jax.Array) -> Design:
+        return _design(problem, target, search(problem, target, ones, theta - 1, rest, measure, max_solves, solver))
+
+    def attempt(carry: tuple[jax.Array, jax.Array, Design]) -> tuple[jax.Array, jax.Array, Design]:
+        turn, theta, best = carry
+        found = once(theta)
+        solves = best.solves + found.solves
+        better = (turn == 0) | ((found.status != DesignStatus.NOT_CONVERGED) & (found.loss < best.loss))
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
+        return turn + 1, found.theta, replace(best, solves=solves)
+
+    def going(carry: tuple[jax.Array, jax.Array, Design]) -> jax.Array:
+        turn, _, best = carry
+        return (turn == 0) | ((turn == 1) & (best.status == DesignStatus.UNREACHABLE))
+
+    def from_start(theta: jax.Array) -> Design:
+        # What cannot be reached is searched once more from there, approached from rest: the search may have come
+        # to it by way of a state that a beam pulled straight to it does not take.
+        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, theta))
+        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, blank))[2]
+
+    found = lax.map(from_start, begin)
+    # The nearest; among those that reach the target the one of least effort.
+    reached = found.status == DesignStatus.REACHED
+    effort = jnp.sum((1 - found.theta) ** 2, axis=1)
+    nearness = jnp.where(reached, -1, jnp.where(jnp.isfinite(found.loss), found.loss, jnp.inf))
+    best = jnp.lexsort((effort, nearness, found.status == DesignStatus.NOT_CONVERGED))[0]
+    return jax.tree.map(lambda leaf: leaf[best], found)
+
+
+@partial(jax.jit, static_argnames=("measure", "max_solves", "solver"))
+def _reach_each(
+    problem: Problem, targets: jax.Array, begin: jax.Array, measure: Measure, max_solves: int, solver: Newton
+) -> Design:
+    first = _reach(problem, targets[0], begin, measure, max_solves, solver)
+
+    def following(carry: tuple[jax.Array, jax.Array], target: jax.Array) -> tuple[Any, Design]:
+        theta, x = carry
+        at = search(problem, target, theta, jnp.zeros_like(theta), x, measure, max_solves, solver)
+        found = _design(problem, target, at)
+        return (found.theta, found.solution.x), found
+
+    return lax.scan(following, (first.theta, first.solution.x), targets)[1]
+
+
+def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:
+    """The report of a search."""
+    close = jnp.max(jnp.abs(at.miss)) <= problem.tolerance
+    ended = jnp.where(close, DesignStatus.REACHED, DesignStatus.UNREACHABLE)
+    return Design(
+        theta=at.theta,
+        solution=at.solution,
+        value=at.miss.reshape(target.shape) + target,
+        loss=jnp.linalg.norm(at.miss),
+        held=jnp.where(close, 0, at.held),
+        solves=at.solves,
+        history=at.history,
+        status=jnp.where(at.resting, ended, DesignStatus.NOT_CONVERGED).astype(jnp.int32),
+    )
+
+
+# --------------------------------------------------------------------------------------------- minimise
+
+# Steps in a row that may be taken back because there is no equilibrium where they lead.
+MAX_SKIPS = 20
+
+
+def minimise(
+    loss: Callable[[Scene, jax.Array], jax.Array],
+    theta0: Any,
+    optimiser: optax.GradientTransformation,
+    steps: int = 200,
+    *,
+    design: Callable[[Any], Scene],
+    tolerance: float = 1e-8,
+    goal: float | None = None,
+    solver: Newton = Newton(),
+    progress: Callable[[int, float], None] | None = None,
+) -> Design:
+    """Parameters that make a loss of the equilibrium least, by any optimiser of optax.
+
+    Each equilibrium is started from the one before. Where the status of one is not `OK` the step that led there is
+    halved, back towards the last good parameters, and the optimiser does not see it. Parameters are not bounded:
+    let `design` map them to what is, for example `ratios = 0.4 + 0.6 * jax.nn.sigmoid(theta)`.
+
+    Args:
+        loss: `(scene, x)` to `()`.
+        theta0: any pytree of float arrays.
+        optimiser: such as `optax.adam(1e-2)` or `optax.lbfgs()`, whose line search solves equilibria of its own.
+        steps: at most so many.
+        design: `theta` to a scene: commands, moduli, stiffness fields, rest positions, whatever it is made of.
+        tolerance: it stops where the largest component of the gradient has fallen to this fraction of the first.
+        goal: it stops at a loss no larger than this. Without one every stationary point is a success.
+        solver: settings of each solve.
+        progress: called with the number of steps and the loss.
+
+    Returns:
+        A `Design`: `REACHED` at the goal, or without one at a stationary point; `UNREACHABLE` at a stationary point
+        over the goal; else `NOT_CONVERGED`. `theta` is the best that was seen.
+
+    Raises:
+        ValueError: if `steps` is not a whole number of at least 0, `theta0` holds no floats, or as `design` does.
+    """
+    if not isinstance(steps, int | np.integer) or steps < 0:
+        raise ValueError(f"steps: expected a whole number of at least 0, got {steps!r}")
+    theta = jax.tree.map(jnp.asarray, theta0)
+    leaves = jax.tree.leaves(theta)
+    if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+        raise ValueError(f"theta0: expected a pytree of float arrays, got {theta0!r}")
+    check_held(design(theta))
+
+    def objective(theta: Any, x: jax.Array) -> tuple[jax.Array, Solution]:
+        scene = design(theta)
+        solution = equilibrium(scene, x, solver)
+        return loss(scene, solution.x), solution
+
+    evaluate = jax.jit(jax.value_and_grad(objective, has_aux=True))
+
+    def finite_loss(theta: Any, x: jax.Array) -> jax.Array:
+        """What a line search sees: no loss at all where there is no equilibrium."""
+        value, solution = objective(theta, x)
+        return jnp.where(solution.status == 0, value, jnp.inf)
+
+    transform = optax.with_extra_args_support(optimiser)
+
+    @jax.jit
+    def advance(theta: Any, state: Any, grad: Any, value: jax.Array, x: jax.Array) -> tuple[Any, Any]:
+        value_fn = partial(finite_loss, x=x)
+        updates, state = transform.update(grad, state, theta, value=value, grad=grad, value_fn=value_fn)
+        return optax.apply_updates(theta, updates), state
+
+    halfway = jax.jit(lambda a, b: jax.tree.map(lambda x, y: 0.5 * (x + y), a, b))
+    state, x = transform.init(theta), design(theta).mesh.nodes
+    tried: list[tuple[Any, float, int]] = []
+    best: tuple[Any, Solution, float] | None = None
+    last, first_slope, solves, skips, status = theta, 0.0, 0, 0, DesignStatus.NOT_CONVERGED
+    for count in range(steps + 1):
+        (value, solution), grad = evaluate(theta, x)
+        number = float(value)
+        slope = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(grad))
+        solves += 1
+        tried.append((theta, number, int(solution.status)))
+        if progress:
+            progress(count, number)
+        good = int(solution.status) == 0 and np.isfinite(number) and np.isfinite(slope)
+        if best is None or (good and number < best[2]):
+            best = (theta, solution, number if good else np.inf)
+        if not good:
+            skips += 1
+            if count == 0 or skips > MAX_SKIPS:
+                break
+            theta = halfway(last, theta)
+            continue
+        last, x, skips = theta, solution.x, 0
+        first_slope = first_slope or slope
+        if goal is not None and number <= goal:
+            status = DesignStatus.REACHED
+            break
+        if slope <= tolerance * first_slope:
+            status = DesignStatus.REACHED if goal is None else DesignStatus.UNREACHABLE
+            break
+        if count < steps:
+            theta, state = advance(theta, state, grad, value, x)
+            solves += int(optax.tree_utils.tree_get(state, "num_linesearch_steps", default=0))
+    assert best is not None
+    thetas, losses, statuses = zip(*tried, strict=True)
+    return Design(
+        theta=best[0],
+        solution=best[1],
+        value=jnp.asarray(best[2]),
+        loss=jnp.asarray(best[2]),
+        held=jnp.zeros(0, jnp.int32),
+        solves=jnp.asarray(solves, jnp.int32),
+        history=History(
+            jax.tree.map(lambda *each: jnp.stack(each), *thetas),
+            jnp.asarray(losses),
+            jnp.asarray(statuses, jnp.int32),
+        ),
+        status=jnp.asarray(status, jnp.int32),
+    )
