@@ -124,7 +124,8 @@ def reach_each(
     problem, begin = _problem(scene, bounds, starts, tolerance, solver)
     shape = _shape(measure, scene)
     if np.ndim(targets) != len(shape) + 1 or np.shape(targets)[1:] != shape or not np.shape(targets)[0]:
-        raise ValueError(f"targets: expected shape (T, *{shape}), a row for each target, got {np.shape(targets)}")
+        rows = f"(T, {shape[0]})" if shape else "(T,)"
+        raise ValueError(f"targets: expected shape {rows}, a row for each target, got {np.shape(targets)}")
     return _reach_each(problem, jnp.asarray(targets, scene.mesh.nodes.dtype), begin, measure, max_solves, solver)
 
 

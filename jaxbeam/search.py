@@ -188,8 +188,9 @@ def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -
     left = jnp.linalg.norm(at.slope @ steps[0] + at.miss)
     best = jnp.where(left <= 0.5 * jnp.linalg.norm(at.miss), 0, 1)
     step, held = steps[best], helds[best]
-    bound = jnp.where(held < 0, problem.low, problem.high)
-    return step, jnp.where(at.theta + step == bound, held, 0)
+    # A command held by the radius alone is not held by a bound.
+    bounded = jnp.where(held < 0, problem.low - at.theta >= -radius, problem.high - at.theta <= radius)
+    return step, jnp.where(bounded, held, 0)
 
 
 def _box_program(
@@ -222,8 +223,8 @@ def _box_program(
         # What the bound has to push with: negative where it would have to pull.
         push = jnp.where(held == 0, 0, -held * (matrix[:m] @ both - rhs[:m]))
         worst, wrong = jnp.argmax(over), jnp.argmin(push)
-        slack = 8 * jnp.finfo(dtype).eps
-        take, drop = over[worst] > slack, push[wrong] < -slack * jnp.max(jnp.abs(rhs[:m]) + 1)
+        slack = 16 * jnp.finfo(dtype).eps
+        take, drop = over[worst] > slack, push[wrong] < -slack * (jnp.abs(matrix[wrong]) @ jnp.abs(both) + 1)
         side = jnp.where(step[worst] > high[worst], 1, -1).astype(jnp.int32)
         taken = held.at[worst].set(side)
         dropped = held.at[wrong].set(0)
@@ -231,5 +232,5 @@ def _box_program(
 
     begin = (jnp.zeros(m, jnp.int32), jnp.zeros((), jnp.int32), jnp.asarray(True))
     held, _, _ = lax.while_loop(lambda c: c[2] & (c[1] < 6 * m + 6), improve, begin)
-    both = solve(held)
-    return jnp.clip(both[:m], low, high), held
+    step = jnp.clip(solve(held)[:m], low, high)
+    return jnp.where(held == 0, step, jnp.where(held < 0, low, high)), held

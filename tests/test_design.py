@@ -1,0 +1,286 @@
+"""Inverse design: targets that are hit, targets that cannot be, the least effort, and any loss by any optimiser."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from helpers import small_beam
+
+import jaxbeam as jb
+
+REACHED, UNREACHABLE, NOT_CONVERGED = jb.DesignStatus
+
+
+def solved(scene: jb.Scene, theta, measure=jb.tip_angle) -> np.ndarray:
+    """The measure of an equilibrium found from rest, apart from any search."""
+    commanded = jb.command(scene, theta)
+    return np.asarray(measure(commanded, jb.check(jb.equilibrium(commanded)).x))
+
+
+# --------------------------------------------------------------------------------------------- angles
+
+
+def test_every_angle_is_hit(beam):
+    """From rest, to 1e-8 degrees, in at most 8 solves; the tendon that would only work against it stays at rest."""
+    for target in np.arange(-34, 34.01, 0.5):
+        found = jb.reach(beam, target)
+        assert int(found.status) == REACHED, target
+        assert abs(float(found.value) - target) <= 1e-8
+        assert abs(float(jb.tip_angle(beam, found.solution.x)) - target) <= 1e-8
+        assert int(found.solves) <= 8
+        assert float(found.theta[1 if target > 0 else 0]) == 1
+        assert ((np.asarray(found.theta) >= 0.4) & (np.asarray(found.theta) <= 1)).all()
+
+
+@pytest.mark.parametrize("target", [-30.0, -0.5, 0.0, 12.5, 34.0])
+def test_the_answer_is_what_a_solve_from_rest_gives(beam, target):
+    found = jb.reach(beam, target)
+    np.testing.assert_allclose(solved(beam, found.theta), target, rtol=0, atol=2e-8)
+    assert int(found.solution.status) == jb.Status.OK
+
+
+def test_history_holds_every_solve(beam):
+    found = jb.reach(beam, 20.0)
+    count = int(found.solves)
+    theta, loss, status = (
+        np.asarray(field) for field in (found.history.theta, found.history.loss, found.history.status)
+    )
+    assert np.isfinite(theta[:count]).all() and np.isnan(theta[count:]).all()
+    assert (status[:count] == 0).all() and (status[count:] == -1).all()
+    np.testing.assert_allclose(theta[0], 1)
+    np.testing.assert_allclose(loss[0], 20.0)
+    np.testing.assert_array_equal(theta[count - 1], found.theta)
+    np.testing.assert_allclose(loss[1], abs(solved(beam, theta[1]) - 20), atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def grid(beam):
+    """Tip angles and tip positions over a dense grid of the commands in [0.4, 1] squared."""
+    line = np.linspace(0.4, 1.0, 16)
+    ratios = np.stack(np.meshgrid(line, line, indexing="ij"), axis=2).reshape(-1, 2)
+    batch = jb.sweep(beam, ratios)
+    good = np.asarray(batch.status) == 0
+    x = batch.x[good]
+    return ratios[good], np.asarray(jax.vmap(lambda x: jb.tip_angle(beam, x))(x)), tip_positions(beam, x)
+
+
+def tip_positions(scene, x):
+    return np.asarray(jax.vmap(lambda x: jb.tip_position(scene, x))(x))
+
+
+@pytest.mark.parametrize(("target", "held"), [(50.0, [-1, 1]), (36.0, [-1, 1]), (-50.0, [1, -1]), (-35.0, [1, -1])])
+def test_beyond_the_bounds(beam, grid, target, held):
+    """The nearest angle is named, a dense grid of commands knows none nearer, and the bounds in the way are told."""
+    found = jb.reach(beam, target)
+    assert int(found.status) == UNREACHABLE
+    assert abs(abs(grid[1] - target).min() - float(found.loss)) <= 0.01
+    assert float(found.loss) <= abs(grid[1] - target).min() + 1e-8
+    np.testing.assert_allclose(abs(float(found.value) - target), found.loss)
+    np.testing.assert_array_equal(found.held, held)
+
+
+def test_beyond_the_peak(beam):
+    """With more room the angle has a peak inside the bounds: no bound is in the way of 50 degrees, and none holds."""
+    found = jb.reach(beam, 50.0, bounds=(0.2, 1.0))
+    ratios = np.linspace(0.2, 0.4, 81)
+    angles = [solved(beam, [ratio, 1.0]) for ratio in ratios]
+    assert int(found.status) == UNREACHABLE
+    np.testing.assert_array_equal(found.held, [0, 1])
+    assert abs(float(found.value) - max(angles)) <= 0.01
+    assert float(found.value) >= max(angles)
+    assert abs(float(found.theta[0]) - ratios[np.argmax(angles)]) < 0.003
+
+
+def test_one_of_two_answers(beam):
+    """37 degrees is reached on either side of the peak; the smaller contraction is the answer."""
+    found = jb.reach(beam, 37.0, bounds=(0.2, 1.0))
+    assert int(found.status) == REACHED
+    assert 0.31 < float(found.theta[0]) < 0.4
+    np.testing.assert_allclose(solved(beam, found.theta), 37.0, atol=2e-8)
+
+
+# ------------------------------------------------------------------------------------------ positions
+
+
+@pytest.mark.parametrize("ratios", [(0.5, 0.9), (0.95, 0.6), (0.7, 0.75), (0.45, 1.0)])
+def test_position_is_hit(beam, ratios):
+    """Two commands, two coordinates: the command that made the position is found again."""
+    target = solved(beam, ratios, jb.tip_position)
+    found = jb.reach(beam, target, jb.tip_position)
+    assert int(found.status) == REACHED
+    np.testing.assert_allclose(found.value, target, rtol=0, atol=1e-8 * 3.5)
+    np.testing.assert_allclose(found.theta, ratios, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [(1.9, 0.5), (0.5, 1.8), (1.2, -1.9)])
+def test_position_out_of_reach(beam, grid, target):
+    """The nearest point: none of a dense grid is nearer."""
+    found = jb.reach(beam, target, jb.tip_position)
+    assert int(found.status) == UNREACHABLE
+    nearest = np.linalg.norm(grid[2] - target, axis=1).min()
+    assert float(found.loss) <= nearest + 1e-8
+    assert float(found.loss) > nearest - 0.05
+    assert np.asarray(found.held).any()
+
+
+def test_path_of_targets(beam):
+    """Each target of a sequence is hit, in fewer solves than from rest."""
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    targets = solved(beam, (0.7, 0.75), jb.tip_position) + 0.06 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    found = jb.reach_each(beam, targets, jb.tip_position)
+    assert (np.asarray(found.status) == REACHED).all()
+    np.testing.assert_allclose(found.value, targets, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(tip_positions(beam, found.solution.x), targets, rtol=0, atol=1e-8)
+    assert np.asarray(found.solves)[1:].max() <= 4
+    assert np.asarray(found.solution.steps)[1:].mean() < 6  # of Newton, in the last of these solves
+    np.testing.assert_allclose(jb.reach(beam, targets[7], jb.tip_position).theta, found.theta[7], rtol=0, atol=1e-7)
+
+
+# --------------------------------------------------------------------------------------- least effort
+
+
+@pytest.fixture(scope="module")
+def many():
+    """A beam with two tendons on each side, so that an angle is reached in many ways."""
+    mesh = jb.rectangle(3.0, 0.6, 9, 3)
+    lines = [[2, 14], [2, 23], [0, 12], [0, 21]]
+    left, right = np.arange(3), np.arange(24, 27)
+    terms = (jb.solid(mesh, jb.lame(1e4, 0.3)), jb.tendons(mesh, lines, [2e3, 1e3, 2e3, 1e3]))
+    return jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
+
+
+@pytest.mark.parametrize("bounds", [(0.3, 1.0), (0.3, 3.0)])
+def test_least_effort(many, bounds):
+    """Where no bound holds, the contraction is along the slope of the angle: Lagrange's condition."""
+    target = 8.0
+    found = jb.reach(many, target, bounds=bounds)
+    assert int(found.status) == REACHED
+
+    def angle(theta):
+        scene = jb.command(many, theta)
+        return jb.tip_angle(scene, jb.equilibrium(scene).x)
+
+    slope, short = np.asarray(jax.jit(jax.grad(angle))(found.theta)), 1 - np.asarray(found.theta)
+    free = (np.asarray(found.theta) > bounds[0]) & (np.asarray(found.theta) < bounds[1])
+    assert free.sum() == (2 if bounds[1] == 1 else 4)
+    price = short[free] @ slope[free] / (slope[free] @ slope[free])
+    np.testing.assert_allclose(short[free], price * slope[free], atol=1e-6)
+    # A command at its bound would only be pushed further out.
+    assert (np.sign(price * slope[~free] - short[~free]) <= 0).all()
+
+
+def test_starts(many):
+    """The best answer over several starts is no worse than from any one of them."""
+    starts = np.array([[1.0, 1.0, 1.0, 1.0], [0.5, 0.9, 1.0, 1.0], [0.9, 0.5, 1.0, 0.8]])
+    effort = lambda found: float(jnp.sum((1 - found.theta) ** 2))
+    together = jb.reach(many, 8.0, bounds=(0.3, 1.0), starts=starts)
+    assert int(together.status) == REACHED
+    assert effort(together) <= effort(jb.reach(many, 8.0, bounds=(0.3, 1.0))) + 1e-9
+
+
+def test_solves_run_out(beam):
+    found = jb.reach(beam, 30.0, max_solves=2)
+    assert int(found.status) == NOT_CONVERGED
+    assert int(found.solves) == 2
+
+
+def test_in_float32():
+    scene = jb.tendon_beam(9, 3, dtype=jnp.float32)
+    found = jb.reach(scene, 10.0)
+    assert int(found.status) == REACHED
+    assert found.theta.dtype == found.value.dtype == jnp.float32
+    assert abs(float(found.value) - 10) <= 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"target": [1.0, 2.0]}, r"target: expected the shape \(\) of the measure, got \(2,\)"),
+        ({"bounds": (0.0, 1.0)}, r"bounds: expected 0 < low <= high, got low \[0.0, 0.0\]"),
+        ({"bounds": (0.9, 0.4)}, "bounds: expected 0 < low <= high"),
+        ({"bounds": ([0.4, 0.4, 0.4], 1.0)}, r"bounds: expected low of shape \(\) or \(2,\), got \(3,\)"),
+        ({"starts": [1.0, 1.0]}, r"starts: expected shape \(S, 2\), a row for each start, got \(2,\)"),
+        ({"tolerance": 0.0}, "tolerance: expected a positive number, got 0.0"),
+        ({"measure": jb.tendon_lengths}, r"target: expected the shape \(2,\) of the measure, got \(\)"),
+        ({"measure": lambda scene, x: x}, r"measure: expected a function \(scene, x\) to shape \(\) or \(p,\)"),
+    ],
+)
+def test_reach_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jb.reach(small_beam(), **({"target": 1.0} | arguments))
+
+
+def test_reach_each_refuses(beam):
+    with pytest.raises(ValueError, match=r"targets: expected shape \(T, 2\), a row for each target, got \(2,\)"):
+        jb.reach_each(beam, [1.0, 2.0], jb.tip_position)
+    with pytest.raises(ValueError, match="expected at least one tendon to command"):
+        mesh = jb.rectangle(1.0, 1.0, 3, 3)
+        jb.reach(jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, [0, 1, 2])), 1.0)
+
+
+# ------------------------------------------------------------------------------------------- minimise
+
+TARGET = 20.0
+
+
+def squared(scene, x):
+    return (jb.tip_angle(scene, x) - TARGET) ** 2
+
+
+def bounded(beam):
+    """Ratios between 0.4 and 1 from numbers without bounds."""
+    return lambda theta: jb.command(beam, 0.4 + 0.6 * jax.nn.sigmoid(theta))
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "steps", "most"), [(optax.adam(0.1), 400, 350), (optax.lbfgs(), 60, 30)], ids=["adam", "lbfgs"]
+)
+def test_optax_reaches_the_angle(beam, optimiser, steps, most):
+    """To 1e-6 degrees, with Adam and with L-BFGS and its line search."""
+    found = jb.minimise(squared, jnp.array([0.0, 2.0]), optimiser, steps, design=bounded(beam), goal=1e-12)
+    assert int(found.status) == REACHED
+    assert abs(float(jb.tip_angle(beam, found.solution.x)) - TARGET) <= 1e-6
+    assert int(found.solves) <= most
+    assert len(found.history.loss) == len(found.history.status) == found.history.theta.shape[0]
+    assert float(found.loss) == float(found.history.loss.min())
+
+
+def test_stationary_point_over_the_goal(beam):
+    """A loss with a floor: its least value is found, and is not called the goal."""
+    floor = lambda scene, x: squared(scene, x) + 3.0
+    found = jb.minimise(floor, jnp.array([0.0, 2.0]), optax.lbfgs(), 60, design=bounded(beam), goal=1.0)
+    assert int(found.status) == UNREACHABLE
+    np.testing.assert_allclose(found.loss, 3.0, rtol=1e-12)
+    free = jb.minimise(floor, jnp.array([0.0, 2.0]), optax.lbfgs(), 60, design=bounded(beam))
+    assert int(free.status) == REACHED
+
+
+def test_step_without_equilibrium_is_taken_back():
+    """Poisson's ratio runs over 0.5: the step is skipped, reported and halved, and the search goes on."""
+    scene = lambda theta: jb.command(small_beam(poisson=theta["poisson"]), jnp.array([0.8, 1.0]))
+    stiff = lambda scene, x: -jb.tip_position(scene, x)[0]
+    found = jb.minimise(stiff, {"poisson": 0.3}, optax.sgd(40.0), 12, design=scene, tolerance=1e-12)
+    status = np.asarray(found.history.status)
+    assert (status[1:] & jb.Status.INVALID).any() and (status == 0).sum() > 1
+    assert int(found.solution.status) == jb.Status.OK
+    assert 0.3 < float(found.theta["poisson"]) < 0.5
+    bad = int(np.argmax(status != 0))
+    tried = np.asarray(found.history.theta["poisson"])
+    np.testing.assert_allclose(tried[bad + 1], 0.5 * (tried[bad - 1] + tried[bad]))
+
+
+def test_no_equilibrium_at_the_start():
+    stuck = jb.Newton(max_steps=0)
+    scene = lambda theta: jb.command(small_beam(), jnp.stack([theta, 1.0]))
+    found = jb.minimise(jb.tip_angle, 0.7, optax.sgd(1.0), 5, design=scene, solver=stuck)
+    assert int(found.status) == NOT_CONVERGED
+    assert int(found.solves) == 1
+    assert np.isinf(found.loss)
+
+
+def test_minimise_refuses(beam):
+    with pytest.raises(ValueError, match="steps: expected a whole number of at least 0, got -1"):
+        jb.minimise(squared, jnp.zeros(2), optax.sgd(1.0), -1, design=bounded(beam))
+    with pytest.raises(ValueError, match="theta0: expected a pytree of float arrays"):
+        jb.minimise(squared, jnp.zeros(2, int), optax.sgd(1.0), 1, design=bounded(beam))
