@@ -16,12 +16,13 @@ README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
 def test_code_runs_as_printed():
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert len(code.strip().splitlines()) < 20
+    code = "\n".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
+    assert len(code.strip().splitlines()) < 45
     run = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert "tip angle 35.5153 degrees" in run.stdout
     assert "tip angle -5.0891 degrees" in run.stdout
+    assert "REACHED" in run.stdout
 
 
 def test_set_up_commands_are_two():
