@@ -8,6 +8,7 @@ derivative, exact, from the factor of the one solve that each step costs.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -71,6 +72,22 @@ class Stand(NamedTuple):
     history: History
 
 
+@partial(jax.jit, static_argnames="solver")
+def approach(
+    scene: Scene, layout: Layout, before: jax.Array, theta: jax.Array, x: jax.Array, ahead: jax.Array, solver: Newton
+) -> tuple[Solution, Any]:
+    """The equilibrium of the command `theta`, from `x` in equilibrium at `before`, and its factor.
+
+    The first attempt starts at `x + ahead`, or as far along as no element inverts. A jitted function of its own, so
+    that it is traced once however often it is used.
+    """
+    way = lambda s: command(scene, (1 - s) * before + s * theta)
+    one = jnp.ones((), x.dtype)
+    length = jnp.minimum(one, largest_step(way(one), x, ahead, solver.keep_volume)).astype(x.dtype)
+    path, factor = follow(way, layout, x + length * ahead, one[None], solver, origin=x)
+    return jax.tree.map(lambda leaf: leaf[0], path), factor
+
+
 def search(
     problem: Problem,
     target: jax.Array,
@@ -89,12 +106,8 @@ def search(
     def look(at: Stand) -> Stand:
         """Solve the command that is tried next. Slopes and bends come from the factor of that solve."""
         theta = jnp.clip(at.theta + at.step, problem.low, problem.high)
-        way = lambda s: unlock(command(problem.scene, (1 - s) * at.theta + s * theta))
         x, ahead = at.solution.x, at.drift @ (theta - at.theta)
-        length = jnp.minimum(1, largest_step(way(jnp.ones((), dtype)), x, ahead, solver.keep_volume))
-        start = x + length.astype(dtype) * ahead
-        path, factor = follow(way, problem.layout, start, jnp.ones(1, dtype), solver, origin=x)
-        solution = jax.tree.map(lambda leaf: leaf[0], path)
+        solution, factor = approach(unlock(problem.scene), problem.layout, at.theta, theta, x, ahead, solver)
 
         def outcome(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
             scene = command(problem.scene, theta)
@@ -135,9 +148,10 @@ def search(
         )
 
     zeros = lambda *shape: jnp.zeros(shape, dtype)
-    scene = unlock(command(problem.scene, theta))
-    blank = jax.eval_shape(lambda: follow(lambda s: scene, problem.layout, x, zeros(1), solver)[0])
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), blank)
+    blank = jax.eval_shape(
+        lambda: approach(unlock(problem.scene), problem.layout, theta, theta, x, zeros(*x.shape), solver)[0]
+    )
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank)
     begin = Stand(
         theta=theta,
         solution=replace(nothing, x=x),

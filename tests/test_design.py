@@ -170,6 +170,7 @@ def test_least_effort(many, bounds):
     assert (np.sign(price * slope[~free] - short[~free]) <= 0).all()
 
 
+@pytest.mark.slow
 def test_starts(many):
     """The best answer over several starts is no worse than from any one of them."""
     starts = np.array([[1.0, 1.0, 1.0, 1.0], [0.5, 0.9, 1.0, 1.0], [0.9, 0.5, 1.0, 0.8]])
