@@ -123,11 +123,12 @@ def search(
         first, new = at.solves == 0, look(at)
         theta, miss = new.theta, new.miss
         good = (new.solution.status == 0) & jnp.all(jnp.isfinite(new.bend)) & jnp.all(jnp.isfinite(new.slope))
-        # Nearer to the target; or cheaper, and not too far from it, which is allowed less and less.
+        # Nearer to the target, or no farther than solves can tell; or cheaper, and not too far from it, which is
+        # allowed less and less.
         far, before = jnp.linalg.norm(miss), jnp.linalg.norm(at.miss)
-        nearer = far <= before * (1 + 16 * jnp.finfo(dtype).eps)
+        nearer = far <= before + 0.1 * problem.tolerance
         cheaper = (far <= at.funnel) & (jnp.sum((1 - theta) ** 2) < jnp.sum((1 - at.theta) ** 2))
-        taken = good & (first | nearer | cheaper | (jnp.max(jnp.abs(miss)) <= 0.1 * problem.tolerance))
+        taken = good & (first | nearer | cheaper)
         funnel = jnp.where(first, 0.1 * far, jnp.where(taken & ~nearer, 0.5 * at.funnel, at.funnel))
         here = jax.tree.map(lambda new, old: jnp.where(taken, new, old), new, at)
         scale = jnp.maximum(at.scale, jnp.where(taken, jnp.sum(new.slope**2), 0))
@@ -196,9 +197,9 @@ def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -
     free = jnp.where(at.held == 0, at.slope, 0)
     gram = free @ free.T + soft * jnp.eye(at.miss.size, dtype=soft.dtype)
     prices = jnp.stack([jnp.linalg.solve(gram, free @ (1 - at.theta)), at.miss / soft])
-    steps, helds = lax.map(
-        lambda each: _box_program(at, each[0], each[1], low, high, soft), (prices, jnp.array([10, 0]))
-    )
+    steep = 10 * jnp.linalg.norm(jnp.einsum("p,pij->ij", prices[0], at.bend)) / jnp.maximum(jnp.sum(at.slope**2), soft)
+    weights = jnp.stack([steep, 1 / soft])
+    steps, helds = lax.map(lambda each: _box_program(at, each[0], each[1], low, high, soft), (prices, weights))
     left = jnp.linalg.norm(at.slope @ steps[0] + at.miss)
     best = jnp.where(left <= 0.5 * jnp.linalg.norm(at.miss), 0, 1)
     step, held = steps[best], helds[best]
@@ -208,18 +209,20 @@ def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -
 
 
 def _box_program(
-    at: Stand, price: jax.Array, steep: jax.Array, low: jax.Array, high: jax.Array, soft: jax.Array
+    at: Stand, price: jax.Array, weight: jax.Array, low: jax.Array, high: jax.Array, soft: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Step and active bounds of the quadratic program whose curvature is that of `price`.
 
-    `steep` times that curvature is added along the slope: where the target decides, nothing needs to be convex.
+    What must be convex is its sum with `weight` times the squared slope, over the commands that no bound held last: the
+    target takes care of the rest.
     """
     m, p, dtype = at.theta.size, at.miss.size, at.theta.dtype
+    free = at.held == 0
+    square = weight * jnp.where(free[:, None] & free, at.slope.T @ at.slope, 0)
     curvature = jnp.einsum("p,pij->ij", price, at.bend)
-    square = jnp.sum(at.slope**2)
-    steep = steep * jnp.linalg.norm(curvature) / jnp.where(square > 0, square, 1)
-    values, vectors = jnp.linalg.eigh(jnp.eye(m, dtype=dtype) + curvature + steep * at.slope.T @ at.slope)
-    convex = (vectors * jnp.maximum(jnp.abs(values), 0.01)) @ vectors.T
+    whole = jnp.eye(m, dtype=dtype) + jnp.where(free[:, None] & free, curvature, 0) + square
+    values, vectors = jnp.linalg.eigh(whole)
+    convex = (vectors * jnp.maximum(jnp.abs(values), 0.01)) @ vectors.T - square
     matrix = jnp.block([[convex, at.slope.T], [at.slope, -soft * jnp.eye(p, dtype=dtype)]])
     rhs = jnp.concatenate([1 - at.theta, -at.miss])
 
