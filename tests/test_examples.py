@@ -13,12 +13,20 @@ NUMBERS = {
     "02_ramp_curves": {"top pulled": 956.0045},
     "04_buckling": {"pulled in steps": -5.0890962},
     "03_own_energy": {"without ground": -34.9502718, "with ground": -7.8098},
+    "05_reach_angle": {"nearest to 50": 35.5152802, "ratio for 34": 0.43470331},
+    "06_follow_path": {"lowest ratio": 0.4667},
+    "07_design_shape": {"before": 0.060367},
+    "08_gradient_check": {"top command": -37.0783, "bottom command": 6.6988, "Hessian's order": 3.00},
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
     "02_ramp_curves": {"tip_angle.png", "tendons.png", "fields_top.png", "fields_both.png"},
     "03_own_energy": {"ground.png"},
     "04_buckling": {"branches.png", "modes.png", "equilibria.png"},
+    "05_reach_angle": {"fan.png", "commands.png"},
+    "06_follow_path": {"path.png", "path.gif"},
+    "07_design_shape": {"design.png"},
+    "08_gradient_check": {"gradient_check.png"},
 }
 
 
@@ -26,11 +34,12 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(NUMBERS)
 
 
-# Its 150 searches take most of a minute; what it traces is tested in test_branch.py.
-LONG = pytest.param("04_buckling", marks=pytest.mark.slow)
+# These take half a minute or more each; what they show is tested in test_branch, test_design and test_implicit.
+LONG = {"04_buckling", "05_reach_angle", "06_follow_path", "07_design_shape", "08_gradient_check"}
+NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in NUMBERS]
 
 
-@pytest.mark.parametrize("name", [*(name for name in NUMBERS if name != "04_buckling"), LONG])
+@pytest.mark.parametrize("name", NAMES)
 def test_example(name, tmp_path):
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)

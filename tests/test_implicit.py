@@ -11,14 +11,31 @@ from helpers import counted, spring_pair, traces
 import jaxbeam as jb
 
 # Differences divide the error of a solve by a step of about 1e-3, so solves go as far down as round-off lets them.
-TIGHT = jb.Newton(rtol=1e-12)
+TIGHT = jb.Newton(rtol=1e-14)
 # Demanded: implicit first derivatives against differences, second against differences of the first.
 FIRST, SECOND = 1e-7, 1e-6
+# Most of the time here is compilation. Unoptimised it takes less than half as long, and the programs run as fast.
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+jit = partial(jax.jit, compiler_options=QUICK)
 
 
 def differences(f, h):
     """Slope of `f` at 0 by the central stencil of order 6, whose truncation is about `h^6`."""
     return sum(w * (np.asarray(f(k * h)) - np.asarray(f(-k * h))) for k, w in ((1, 45), (2, -9), (3, 1))) / (60 * h)
+
+
+def to_second_order(f):
+    """Of `f(v) -> (scalar, solution)`: value, gradient in both modes, Hessian and solution, from a single solve."""
+
+    def first(v):
+        (value, solution), reverse = jax.value_and_grad(f, has_aux=True)(v)
+        return (value, reverse), (value, reverse, solution)
+
+    def expanded(v):
+        (forward, hessian), (value, reverse, solution) = jax.jacfwd(first, has_aux=True)(v)
+        return {"value": value, "forward": forward, "reverse": reverse, "hessian": hessian, "solution": solution}
+
+    return expanded
 
 
 # ------------------------------------------------------- a beam with every kind of parameter
@@ -33,13 +50,13 @@ def parameters(beam, ratios):
     """Those of a `tendon_beam`, of a load on its tip and of a strap; the last two of no strength."""
     count = len(beam.mesh.elements)
     return {
-        "ratios": jnp.asarray(ratios),
-        "modulus": jnp.full(2, 2e3),
-        "young": jnp.full(count, 1e4),
-        "poisson": jnp.full(count, 0.45),
-        "load": jnp.zeros((beam.tip.size, 2)),
-        "nodes": beam.mesh.nodes,
-        "strap": {"stiffness": jnp.zeros(1), "length": jnp.ones(1)},
+        "ratios": np.asarray(ratios),
+        "modulus": np.full(2, 2e3),
+        "young": np.full(count, 1e4),
+        "poisson": np.full(count, 0.45),
+        "load": np.zeros((beam.tip.size, 2)),
+        "nodes": np.asarray(beam.mesh.nodes),
+        "strap": {"stiffness": np.zeros(1), "length": np.ones(1)},
     }
 
 
@@ -103,18 +120,7 @@ def reference_angle(steps):
     return jb.tip_angle(scene, solution.x), solution
 
 
-@jax.jit
-def expansion(steps):
-    """Tip angle of the reference scene after `steps` along the `KINDS`: gradient in both modes, Hessian, solution."""
-
-    def first(steps):
-        (angle, solution), gradient = jax.value_and_grad(reference_angle, has_aux=True)(steps)
-        return (angle, gradient), (angle, gradient, solution)
-
-    (forward, hessian), (angle, reverse, solution) = jax.jacfwd(first, has_aux=True)(steps)
-    return {"angle": angle, "forward": forward, "reverse": reverse, "hessian": hessian, "solution": solution}
-
-
+expansion = jit(to_second_order(reference_angle))
 AT_COMMANDS = {"(0.4, 1.0)": np.zeros(len(KINDS)), "(0.6, 1.0)": 0.2 * np.eye(len(KINDS))[0]}
 each_command = pytest.mark.parametrize("steps", AT_COMMANDS.values(), ids=AT_COMMANDS)
 
@@ -122,17 +128,16 @@ each_command = pytest.mark.parametrize("steps", AT_COMMANDS.values(), ids=AT_COM
 def test_reference_lengths():
     """By the commanded lengths, degrees per length, as central differences of another code give them."""
     at = expansion(np.zeros(len(KINDS)))
-    assert abs(at["angle"] - 35.5152802) < 1e-6  # it is the reference scene
+    assert abs(at["value"] - 35.5152802) < 1e-6  # it is the reference scene
     np.testing.assert_allclose(at["reverse"][:2] / 1.75, [-21.18765, 3.82786], rtol=1e-5)
 
 
-@each_command
 @each_kind
-def test_reference_differences(kind, steps):
-    """First derivatives against differences of values, second ones against differences of the first."""
+def test_reference_differences(kind):
+    """At (0.4, 1.0): first derivatives against differences of values, second ones against differences of the first."""
     axis = np.eye(len(KINDS))[KINDS.index(kind)]
-    column = lambda t: np.append((at := expansion(steps + t * axis))["angle"], at["reverse"])
-    at, found = expansion(steps), differences(column, 1e-3)
+    column = lambda t: np.append((at := expansion(t * axis))["value"], at["reverse"])
+    at, found = expansion(0 * axis), differences(column, 1e-3)
     assert int(at["solution"].status) == jb.Status.OK
     np.testing.assert_allclose(at["reverse"][KINDS.index(kind)], found[0], rtol=FIRST)
     hessian = at["hessian"][KINDS.index(kind)]
@@ -152,11 +157,359 @@ def test_taylor_remainders(steps):
     d = np.random.default_rng(1).uniform(-1, 1, len(KINDS))
     at = expansion(steps)
     slope, curvature = d @ at["reverse"], d @ at["hessian"] @ d
-    sizes = np.geomspace(1e-4, 1e-2, 9)
-    change = np.array([expansion(steps + h * d)["angle"] - at["angle"] for h in sizes])
+    sizes = np.geomspace(4e-5, 4e-3, 9)
+    change = np.array([expansion(steps + h * d)["value"] - at["value"] for h in sizes])
     linear = np.abs(change - sizes * slope)
     quadratic = np.abs(change - sizes * slope - 0.5 * sizes**2 * curvature)
-    print(linear, quadratic)
     order = lambda remainder: np.polyfit(np.log(sizes), np.log(remainder), 1)[0]
     assert order(linear) == pytest.approx(2, abs=0.02)
     assert order(quadratic) == pytest.approx(3, abs=0.02)
+
+
+# ---------------------------------------------------------------------------- ten random scenes
+
+SMALL = jb.tendon_beam(7, 5)
+SMALL_ALONG = directions(SMALL)
+COUNT = 10
+
+
+def small_measures(theta, x0):
+    """Angle, energy, smallest J and first ratio of the small beam, to differentiate; the same again, and solution."""
+    scene = built(SMALL, theta)
+    solution = jb.equilibrium(scene, x0, TIGHT)
+    angle = jb.tip_angle(scene, solution.x)
+    values = jnp.stack([angle, solution.energy, solution.smallest_jacobian, solution.ratios[0]])
+    return values, (values, solution)
+
+
+# Of `COUNT` stacked parameters and starts: derivatives by both, and `(values, solution)`.
+slopes = jit(jax.vmap(jax.jacrev(small_measures, argnums=(0, 1), has_aux=True)))
+
+
+def stacked(thetas):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *thetas)
+
+
+def with_commands(theta, rows):
+    """The parameters stacked `COUNT` times, with these commands; the last one fills what is left."""
+    filled = [*rows, *[rows[-1]] * (COUNT - len(rows))]
+    return stacked([theta | {"ratios": np.asarray(row)} for row in filled])
+
+
+def random_parameters(seed):
+    rng = np.random.default_rng(seed)
+    theta = parameters(SMALL, rng.uniform(0.6, 1.2, 2))
+    spacing = float(SMALL.mesh.nodes[1, 1] - SMALL.mesh.nodes[0, 1])
+    return theta | {
+        "modulus": rng.uniform(1e3, 3e3, 2),
+        "young": rng.uniform(0.5e4, 2e4, theta["young"].shape),
+        "poisson": rng.uniform(0.2, 0.45, theta["poisson"].shape),
+        "load": 10 * rng.standard_normal(theta["load"].shape),
+        "nodes": theta["nodes"] + 0.15 * spacing * rng.uniform(-1, 1, theta["nodes"].shape),
+        "strap": {"stiffness": rng.uniform(0.1, 1, 1), "length": rng.uniform(3, 4, 1)},
+    }
+
+
+THETA = random_parameters(0)
+
+
+@pytest.fixture(scope="module")
+def random_scenes():
+    """Parameters of ten random scenes, and what `slopes` finds of them from rest."""
+    thetas = stacked([random_parameters(seed) for seed in range(COUNT)])
+    return thetas, slopes(thetas, thetas["nodes"])
+
+
+def directional(kind, thetas, found):
+    """Derivatives of angle, energy, smallest J and ratio in a kind of parameter; the same by differences of solves."""
+    (by_theta, _), (_, solution) = found
+    np.testing.assert_array_equal(solution.status, jb.Status.OK)
+    change = jax.tree.map(lambda leaf: leaf[KINDS.index(kind)], SMALL_ALONG)
+    shifted = lambda t: slopes(jax.tree.map(lambda v, d: v + t * d, thetas, change), solution.x)[1][0]
+    product = lambda slope, d: np.asarray(slope).reshape(COUNT, 4, -1) @ d.ravel()
+    return sum(jax.tree.leaves(jax.tree.map(product, by_theta, change))), differences(shifted, 2e-3)
+
+
+@each_kind
+def test_random_differences(kind, random_scenes):
+    slope, found = directional(kind, *random_scenes)
+    np.testing.assert_allclose(slope[:, :3], found[:, :3], rtol=FIRST)
+
+
+def test_rest_is_no_singular_point():
+    """No NaN where tendons have no force and the singular values of F are equal, nor beside it."""
+    thetas = with_commands(parameters(SMALL, [1.0, 1.0]), [[1.0, 1.0], [1.0, 1.0 - 1e-9]])
+    found = slopes(thetas, thetas["nodes"])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found[0]))
+    for kind in ("top command", "bottom command", "load"):  # the others do nothing here
+        slope, expected = directional(kind, thetas, found)
+        np.testing.assert_allclose(slope[:, 0], expected[:, 0], rtol=FIRST)
+    assert np.isfinite(expansion(0.6 * np.eye(len(KINDS))[0])["hessian"]).all()
+
+
+def test_energy_by_the_envelope_theorem(random_scenes):
+    """A stationary energy changes as it would at fixed positions, but for the clamp, which the rest positions carry."""
+    thetas, ((by_theta, _), (_, solution)) = random_scenes
+    partial_slopes = jit(jax.vmap(jax.grad(lambda theta, x: jb.energy(built(SMALL, theta), x), argnums=(0, 1))))
+    expected, by_x = partial_slopes(thetas, solution.x)
+    expected["nodes"] += jnp.where(SMALL.fixed, by_x, 0)
+    for got, wanted in zip(jax.tree.leaves(by_theta), jax.tree.leaves(expected), strict=True):
+        # A first-order change of x that meets forces balanced to 1e-14 of the largest.
+        np.testing.assert_allclose(got[:, 1], wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+
+
+def test_ratios_are_differentiable(random_scenes):
+    _, ((by_theta, _), _) = random_scenes
+    np.testing.assert_allclose(by_theta["ratios"][:, 3], np.tile([1.0, 0.0], (COUNT, 1)), rtol=1e-14)
+    # Rest positions change natural and commanded length alike.
+    np.testing.assert_allclose(by_theta["nodes"][:, 3], 0, atol=1e-14)
+    assert not by_theta["young"][:, 3].any()
+
+
+def test_start_has_no_influence(random_scenes):
+    _, ((_, by_start), _) = random_scenes
+    assert not by_start.any()
+
+
+# ------------------------------------------------------------------------------ many commands
+
+# Another linear solver than `slopes` uses, with which they are compared; and it compiles faster.
+DENSE = jb.Newton(rtol=1e-14, linear=jb.Dense())
+ROWS = [[0.7, 1.0], [1.0, 0.8], [0.9, 1.1]]
+tip_angles = jax.vmap(jb.tip_angle, in_axes=(None, 0))
+
+
+@jit
+@partial(jax.jacrev, argnums=(0, 1), has_aux=True)
+def ramp_slopes(theta, end):
+    scene = built(SMALL, theta)
+    path = jb.ramp(scene, end, len(ROWS), DENSE)
+    return tip_angles(scene, path.x), path
+
+
+@jit
+@partial(jax.grad, argnums=(0, 1), has_aux=True)
+def sweep_slopes(theta, rows, weights, masked):
+    """Derivatives of a weighted sum of angles, by parameters and commands; and the solutions."""
+    scene = built(SMALL, theta)
+    batch = jb.sweep(scene, rows, DENSE)
+    return jnp.where((batch.status == 0) | ~masked, tip_angles(scene, batch.x), 0) @ weights, batch
+
+
+def close(got, expected):
+    """Two solvers agree in the derivatives to what their round-off leaves."""
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(b).max())
+
+
+def angle_slopes(theta, rows, starts):
+    """From `slopes`, a row for each command: derivatives of the angle by all but the command, and by the command."""
+    starts = np.concatenate([starts, np.repeat(starts[-1:], COUNT - len(rows), axis=0)])
+    (by_theta, _), _ = slopes(with_commands(theta, rows), starts)
+    by_theta = jax.tree.map(lambda leaf: leaf[: len(rows), 0], by_theta)
+    return by_theta, by_theta.pop("ratios")
+
+
+def test_ramp_step_by_step():
+    """Each step's derivative is that of the equilibrium there; by the end command, its share of the way."""
+    end = jnp.array([0.6, 0.9])
+    (by_theta, by_end), path = ramp_slopes(THETA, end)
+    np.testing.assert_array_equal(path.status, jb.Status.OK)
+    expected, by_command = angle_slopes(THETA, jb.commands(end, len(ROWS)), path.x)
+    assert not by_theta.pop("ratios").any()  # the ramp commands others
+    close(by_theta, expected)
+    close(by_end, by_command * np.linspace(0, 1, len(ROWS))[:, None])
+
+
+def test_sweep_lane_by_lane():
+    for lane in range(len(ROWS)):
+        (by_theta, by_rows), batch = sweep_slopes(THETA, jnp.array(ROWS), jnp.eye(len(ROWS))[lane], True)
+        expected, by_command = angle_slopes(THETA, ROWS, batch.x)
+        by_theta.pop("ratios")
+        close(by_theta, jax.tree.map(lambda leaf, lane=lane: leaf[lane], expected))
+        close(by_rows, np.eye(len(ROWS))[lane][:, None] * by_command)
+
+
+# Zero times an infinite or undefined slope of `command` is NaN.
+HARMFUL = pytest.mark.xfail(
+    strict=True, reason="a masked lane whose command is 0 or not finite harms shared parameters"
+)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [[-0.5, 1.0], *(pytest.param([value, 1.0], marks=HARMFUL) for value in (0.0, np.nan, np.inf))],
+    ids=str,
+)
+def test_masked_sweep(bad):
+    """A lane that failed and is not looked at leaves the gradient of the others; looked at, it is NaN."""
+    rows, weights = jnp.array([ROWS[0], bad, ROWS[2]]), jnp.ones(len(ROWS))
+    (by_theta, by_rows), batch = sweep_slopes(THETA, rows, weights, True)
+    assert [bool(status) for status in batch.status] == [False, True, False]
+    (expected, expected_rows), _ = sweep_slopes(THETA, jnp.array(ROWS), jnp.array([1.0, 0, 1]), True)
+    close(by_theta, expected)
+    close(by_rows[::2], expected_rows[::2])
+    (by_theta, by_rows), _ = sweep_slopes(THETA, rows, weights, False)
+    assert np.isnan(by_theta["young"]).all()
+    assert np.isnan(by_rows[1]).all()
+
+
+# ------------------------------------------------------------------------ outside jit, and float32
+
+
+def scalar_angle(scalars):
+    """Tip angle from one number for each property, all of it outside jit."""
+    scene = built(SMALL, THETA | scalars)
+    solution = jb.equilibrium(scene, None, DENSE)
+    return jb.tip_angle(scene, solution.x), solution
+
+
+def test_scalars_outside_jit():
+    """One Young's modulus, Poisson's ratio and tendon modulus for all."""
+    scalars = {"young": 1e4, "poisson": 0.4, "modulus": 2e3}
+    (_, solution), slope = jax.value_and_grad(scalar_angle, has_aux=True)(scalars)
+    assert int(jb.check(solution).status) == jb.Status.OK
+    for name, value in scalars.items():
+        found = differences(
+            lambda t, name=name, value=value: scalar_angle(scalars | {name: value + t})[0], 2e-3 * value
+        )
+        np.testing.assert_allclose(slope[name], found, rtol=FIRST)
+
+
+def test_new_values_compile_nothing():
+    """Gradients at other commands, moduli, and on another topology of the same shape: traced once, for all of them."""
+    slope = lambda beam, theta: jax.grad(
+        lambda young: jb.equilibrium(built(beam, theta | {"young": young}), None, DENSE).x[-1, 1]
+    )(theta["young"])
+    slope(SMALL, THETA)
+    before = traces["density"]
+    mirrored = jb.tendon_beam(7, 5, diagonals="mirrored")
+    for beam, theta in ((SMALL, THETA | {"ratios": np.array([0.8, 0.9])}), (mirrored, random_parameters(1))):
+        assert np.isfinite(slope(beam, theta)).all()
+    assert traces["density"] == before
+
+
+def test_a_gradient_takes_no_newton_steps():
+    """Of a sweep inside jit, as many as of the same solves without a derivative."""
+    _, batch = sweep_slopes(THETA, jnp.array(ROWS), jnp.ones(len(ROWS)), True)
+    plain = [jb.equilibrium(built(SMALL, THETA | {"ratios": jnp.array(row)}), None, DENSE).steps for row in ROWS]
+    np.testing.assert_array_equal(batch.steps, plain)
+
+
+def test_float32():
+    """The gradient of a float32 scene is float32, and near that of the same scene in float64."""
+    single = jb.tendon_beam(7, 5, dtype=jnp.float32)
+    theta = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), THETA)
+
+    @jit
+    @jax.grad
+    def slope(theta):
+        scene = built(single, theta)
+        return jb.tip_angle(scene, jb.equilibrium(scene, None, jb.Newton(linear=jb.Dense())).x)
+
+    by_theta = slope(theta)
+    (expected, _), _ = slopes(stacked([THETA] * COUNT), stacked([THETA["nodes"]] * COUNT))
+    for got, wanted in zip(jax.tree.leaves(by_theta), jax.tree.leaves(expected), strict=True):
+        assert got.dtype == jnp.float32
+        np.testing.assert_allclose(got, wanted[0, 0], rtol=0, atol=1e-3 * np.abs(wanted[0, 0]).max())
+
+
+# ------------------------------------------------- two springs: closed form, and no derivative
+
+PAIR = spring_pair(1.0)
+ABOVE = PAIR.mesh.nodes.at[2, 1].set(0.5)
+IMPATIENT = jb.Newton(max_steps=1, escape=False, linear=jb.Dense())
+
+
+def hung(ratios, x0, solver=DENSE):
+    """Where the free node comes to rest, `x + 2 y`."""
+    solution = jb.equilibrium(jb.command(PAIR, ratios), x0, solver)
+    return solution.x[2] @ jnp.array([1.0, 2.0]), solution
+
+
+def apex(ratios):
+    """The same, of a triangle over the base 2 whose sides have the commanded lengths."""
+    across = (ratios[0] ** 2 - ratios[1] ** 2) / 4
+    return across + 2 * jnp.sqrt(ratios[0] ** 2 - (1 + across) ** 2)
+
+
+@partial(jit, static_argnames="solver")
+def hung_slopes(ratios, x0, solver=DENSE):
+    return to_second_order(lambda ratios: hung(ratios, x0, solver))(ratios)
+
+
+TAUT = np.array([1.2, 1.1])
+
+
+def test_closed_form():
+    at = hung_slopes(TAUT, ABOVE)
+    assert at["value"] == pytest.approx(float(apex(TAUT)), rel=1e-12)
+    for name in ("forward", "reverse"):
+        np.testing.assert_allclose(at[name], jax.grad(apex)(TAUT), rtol=1e-10)
+    np.testing.assert_allclose(at["hessian"], jax.hessian(apex)(TAUT), rtol=1e-10)
+
+
+def test_compositions():
+    """The other orders in which to differentiate twice, and one in which to do so thrice, against the closed form."""
+
+    @jit
+    def composed(ratios, x0):
+        value = lambda ratios: hung(ratios, x0)[0]
+        reverse = lambda ratios: (both := jax.jacrev(jax.jacrev(value))(ratios), both)
+        thrice, both = jax.jacfwd(reverse, has_aux=True)(ratios)
+        return [both, jax.jacfwd(jax.jacfwd(value))(ratios), jax.jacrev(jax.jacfwd(value))(ratios)], thrice
+
+    twice, thrice = composed(TAUT, ABOVE)
+    for hessian in twice:
+        np.testing.assert_allclose(hessian, jax.hessian(apex)(TAUT), rtol=1e-10)
+    np.testing.assert_allclose(thrice, jax.jacfwd(jax.hessian(apex))(TAUT), rtol=1e-9)
+
+
+def test_ends_of_a_tendon_nearly_meet():
+    """2e-6 apart: the node moves along the line by half the difference of the commands."""
+    at = hung_slopes(np.array([1e-6, 2 - 3e-6]), PAIR.mesh.nodes)
+    assert int(at["solution"].status) == jb.Status.OK
+    assert 1 + at["solution"].x[2, 0] == pytest.approx(2e-6, rel=1e-6)
+    np.testing.assert_allclose(at["reverse"], [0.5, -0.5], rtol=1e-6)
+    np.testing.assert_allclose(at["forward"], [0.5, -0.5], rtol=1e-6)
+
+
+NOWHERE = {
+    "limit of stability": ([1.0, 1.0], PAIR.mesh.nodes, DENSE, jb.Status.INACCURATE),
+    "negative command": ([-1.0, 1.0], PAIR.mesh.nodes, DENSE, jb.Status.INVALID),
+    "saddle": ([1.1, 1.1], PAIR.mesh.nodes, IMPATIENT, jb.Status.UNSTABLE),
+    "one Newton step": ([1.1, 1.1], ABOVE, IMPATIENT, jb.Status.NOT_CONVERGED),
+}
+
+
+@pytest.mark.parametrize(("ratios", "x0", "solver", "flag"), NOWHERE.values(), ids=NOWHERE)
+def test_no_derivative_without_an_answer(ratios, x0, solver, flag):
+    at = hung_slopes(np.array(ratios), x0, solver)
+    assert int(at["solution"].status) & flag
+    assert all(np.isnan(at[name]).all() for name in ("forward", "reverse", "hessian"))
+
+
+def test_vmap_is_a_loop():
+    """Of the derivatives, too: a lane without one is NaN, and its neighbours do not notice."""
+    rows = jnp.array([[1.2, 1.1], [0.9, 0.8], [-1.0, 1.0], [1.1, 1.2]])
+    many = jit(jax.vmap(jax.value_and_grad(hung, has_aux=True), in_axes=(0, None)))(rows, ABOVE)
+    for lane, row in enumerate(rows):
+        one = hung_slopes(row, ABOVE)
+        (value, solution), slope = jax.tree.map(lambda leaf, lane=lane: leaf[lane], many)
+        assert (solution.status == 0) == (one["solution"].status == 0)
+        np.testing.assert_allclose(value, one["value"], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(slope, one["reverse"], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.xfail(strict=True, raises=jax.errors.TracerBoolConversionError, reason="its check reads a traced number")
+def test_start_may_be_a_constant_inside_jit():
+    jax.eval_shape(lambda ratios: hung(ratios, np.asarray(ABOVE)), TAUT)
+
+
+def test_sweep_in_forward_mode():
+    """The lanes do not mix: each moves with its own command, by half the difference, or is NaN."""
+    rows = np.array([[0.8, 0.9], [-1.0, 1.0], [0.9, 0.7]])
+    across = jit(jax.jacfwd(lambda rows: jb.sweep(PAIR, rows, DENSE).x[:, 2, 0]))(rows)
+    expected = np.eye(3)[:, :, None] * np.array([0.5, -0.5])
+    expected[1, 1] = np.nan
+    np.testing.assert_allclose(across, expected, rtol=1e-12, atol=1e-12)
