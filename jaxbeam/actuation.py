@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Numbers, is_concrete, unlock
+from jaxbeam._tree import Numbers, is_concrete, replace, unlock
 from jaxbeam.equilibrium import Solution, _equilibrium, differentiable, follow
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout
@@ -108,6 +108,21 @@ def _sweep(scene: Scene, layout: Layout, rows: jax.Array, solver: Newton) -> Sol
     return lax.map(lambda ratios: _equilibrium(command(scene, ratios), layout, scene.mesh.nodes, solver)[0], rows)
 
 
+@jax.custom_jvp
+def _sane(ratios: jax.Array, good: jax.Array) -> jax.Array:
+    """The command of a good row; ratio 1 in place of a bad one, which may be 0 or NaN. Derivatives pass through.
+
+    What nobody looks at has cotangent zero; times the slope of a bad command that would still be NaN, and spread
+    from one row to the parameters that all rows share.
+    """
+    return jnp.where(good, ratios, 1)
+
+
+@_sane.defjvp
+def _sane_jvp(primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    return _sane(*primals), tangents[0]
+
+
 @partial(jax.jit, static_argnames="solver")
 def _differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: Solution, solver: Newton) -> Solution:
     """Solutions `(B, ...)` of the commands `rows` `(B, m)` as functions of these and of the scene.
@@ -118,6 +133,8 @@ def _differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: S
     @jax.checkpoint
     def one(row_and_solution: tuple[jax.Array, Solution]) -> Solution:
         ratios, solution = row_and_solution
-        return differentiable(command(scene, ratios), layout, solution, None, solver)
+        good = solution.status == 0
+        moved = differentiable(command(scene, _sane(ratios, good)), layout, solution, None, solver)
+        return replace(moved, ratios=ratios, energy=jnp.where(good, moved.energy, solution.energy))
 
     return lax.map(one, (rows, found))

@@ -214,7 +214,8 @@ def start(scene: Scene, x0: Numbers | None) -> jax.Array:
             node = np.flatnonzero(~finite)[0]
             raise ValueError(f"x0: expected finite positions, got {np.asarray(x0)[node].tolist()} at node {node}")
         volume, element = _worst_element(unlock(scene), x)
-        if not volume > 0:
+        # Inside jit it is traced although all that it is made of is not.
+        if is_concrete(volume) and not volume > 0:
             raise ValueError(
                 f"x0: element {element} is inverted (J = {float(volume):.3g}); start from rest, or from a "
                 f"state in which every J is positive"

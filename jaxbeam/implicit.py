@@ -48,6 +48,8 @@ def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tupl
     scene, layout, found, factor, trusted = primals
     scene_dot = tangents[0]
     x = follow_scene(linear, *primals)
+    # The slope of a bad solution is NaN: kept out of second derivatives that do not look at it.
+    at = jnp.where(trusted, x, found)
     if factor is None:
         factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(*lax.stop_gradient((scene, found)))))
     factor = lax.stop_gradient(factor)
@@ -55,7 +57,7 @@ def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tupl
 
     def product(v: jax.Array) -> jax.Array:
         """The stiffness times a vector of unknowns."""
-        return gather(layout, jax.jvp(lambda y: slope(scene, y), (x,), (expand(layout, v, x.shape),))[1])
+        return gather(layout, jax.jvp(lambda y: slope(scene, y), (at,), (expand(layout, v, x.shape),))[1])
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
         y = linear.solve(layout, factor, b)
@@ -63,6 +65,6 @@ def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tupl
 
     # Fixed coordinates are at rest, and move with the rest positions.
     carried = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
-    pull = jax.jvp(slope, (scene, x), (scene_dot, carried))[1]
+    pull = jax.jvp(slope, (scene, at), (scene_dot, carried))[1]
     moved = lax.custom_linear_solve(product, -gather(layout, pull), solve, symmetric=True)
     return x, expand(layout, moved, x.shape) + carried

@@ -330,17 +330,7 @@ def test_sweep_lane_by_lane():
         close(by_rows, np.eye(len(ROWS))[lane][:, None] * by_command)
 
 
-# Zero times an infinite or undefined slope of `command` is NaN.
-HARMFUL = pytest.mark.xfail(
-    strict=True, reason="a masked lane whose command is 0 or not finite harms shared parameters"
-)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [[-0.5, 1.0], *(pytest.param([value, 1.0], marks=HARMFUL) for value in (0.0, np.nan, np.inf))],
-    ids=str,
-)
+@pytest.mark.parametrize("bad", [[value, 1.0] for value in (-0.5, 0.0, np.nan, np.inf)], ids=str)
 def test_masked_sweep(bad):
     """A lane that failed and is not looked at leaves the gradient of the others; looked at, it is NaN."""
     rows, weights = jnp.array([ROWS[0], bad, ROWS[2]]), jnp.ones(len(ROWS))
@@ -445,8 +435,8 @@ def test_closed_form():
     at = hung_slopes(TAUT, ABOVE)
     assert at["value"] == pytest.approx(float(apex(TAUT)), rel=1e-12)
     for name in ("forward", "reverse"):
-        np.testing.assert_allclose(at[name], jax.grad(apex)(TAUT), rtol=1e-10)
-    np.testing.assert_allclose(at["hessian"], jax.hessian(apex)(TAUT), rtol=1e-10)
+        np.testing.assert_allclose(at[name], jit(jax.grad(apex))(TAUT), rtol=1e-10)
+    np.testing.assert_allclose(at["hessian"], jit(jax.hessian(apex))(TAUT), rtol=1e-10)
 
 
 def test_compositions():
@@ -461,8 +451,8 @@ def test_compositions():
 
     twice, thrice = composed(TAUT, ABOVE)
     for hessian in twice:
-        np.testing.assert_allclose(hessian, jax.hessian(apex)(TAUT), rtol=1e-10)
-    np.testing.assert_allclose(thrice, jax.jacfwd(jax.hessian(apex))(TAUT), rtol=1e-9)
+        np.testing.assert_allclose(hessian, jit(jax.hessian(apex))(TAUT), rtol=1e-10)
+    np.testing.assert_allclose(thrice, jit(jax.jacfwd(jax.hessian(apex)))(TAUT), rtol=1e-9)
 
 
 def test_ends_of_a_tendon_nearly_meet():
@@ -501,7 +491,6 @@ def test_vmap_is_a_loop():
         np.testing.assert_allclose(slope, one["reverse"], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.xfail(strict=True, raises=jax.errors.TracerBoolConversionError, reason="its check reads a traced number")
 def test_start_may_be_a_constant_inside_jit():
     jax.eval_shape(lambda ratios: hung(ratios, np.asarray(ABOVE)), TAUT)
 
