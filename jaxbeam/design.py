@@ -276,7 +276,9 @@ def minimise(
     """
     if not isinstance(steps, int | np.integer) or steps < 0:
         raise ValueError(f"steps: expected a whole number of at least 0, got {steps!r}")
-    theta = jax.tree.map(jnp.asarray, theta0)
+    # A weak dtype turns strong in the first update, and all would be compiled again.
+    strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype))
+    theta = strong(theta0)
     leaves = jax.tree.leaves(theta)
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise ValueError(f"theta0: expected a pytree of float arrays, got {theta0!r}")
@@ -303,7 +305,7 @@ def minimise(
         return optax.apply_updates(theta, updates), state
 
     halfway = jax.jit(lambda a, b: jax.tree.map(lambda x, y: 0.5 * (x + y), a, b))
-    state, x = transform.init(theta), design(theta).mesh.nodes
+    state, x = strong(transform.init(theta)), design(theta).mesh.nodes
     tried: list[tuple[Any, float, int]] = []
     best: tuple[Any, Solution, float] | None = None
     last, first_slope, solves, skips, status = theta, 0.0, 0, 0, DesignStatus.NOT_CONVERGED

@@ -180,12 +180,14 @@ def test_starts(many):
     assert effort(together) <= effort(jb.reach(many, 8.0, bounds=(0.3, 1.0))) + 1e-9
 
 
+@pytest.mark.slow
 def test_solves_run_out(beam):
     found = jb.reach(beam, 30.0, max_solves=2)
     assert int(found.status) == NOT_CONVERGED
     assert int(found.solves) == 2
 
 
+@pytest.mark.slow
 def test_in_float32():
     scene = jb.tendon_beam(9, 3, dtype=jnp.float32)
     found = jb.reach(scene, 10.0)

@@ -180,6 +180,7 @@ def test_slender_cantilever():
     assert abs((4 * errors[1] - errors[0]) / 3) < 0.004
 
 
+@pytest.mark.slow
 def test_penalty_clamp(beam, steered):
     """The published clamp, springs of 1e9 on the left edge, gives the eliminated clamp's answer to 1e-5 degrees."""
     exact, solution = steered

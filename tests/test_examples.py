@@ -34,9 +34,8 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(NUMBERS)
 
 
-# These take half a minute or more each; what they show is tested in test_branch, test_design and test_implicit.
-LONG = {"04_buckling", "05_reach_angle", "06_follow_path", "07_design_shape", "08_gradient_check"}
-NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in NUMBERS]
+# The others compile for half a minute or more each; what they show is tested in files of its own.
+NAMES = [name if name == "01_steer_beam" else pytest.param(name, marks=pytest.mark.slow) for name in NUMBERS]
 
 
 @pytest.mark.parametrize("name", NAMES)
