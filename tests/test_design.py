@@ -124,6 +124,7 @@ def test_position_out_of_reach(beam, grid, target):
     assert np.asarray(found.held).any()
 
 
+@pytest.mark.slow
 def test_path_of_targets(beam):
     """Each target of a sequence is hit, in fewer solves than from rest."""
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
@@ -249,6 +250,7 @@ def test_optax_reaches_the_angle(beam, optimiser, steps, most):
     assert float(found.loss) == float(found.history.loss.min())
 
 
+@pytest.mark.slow
 def test_stationary_point_over_the_goal(beam):
     """A loss with a floor: its least value is found, and is not called the goal."""
     floor = lambda scene, x: squared(scene, x) + 3.0
