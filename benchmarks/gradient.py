@@ -9,15 +9,12 @@ parameter and one more. Medians; compile time apart.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
+from benchmarks.timing import seconds
 
 REPEATS = 51
 STEP = 1e-6
@@ -27,13 +24,6 @@ def angle(ratios: jax.Array, young: jax.Array) -> jax.Array:
     """Tip angle in degrees of the reference beam, from rest."""
     scene = jb.command(jb.tendon_beam(young=young), ratios)
     return jb.tip_angle(scene, jb.equilibrium(scene).x)
-
-
-def seconds(run: Callable[..., Any], *arguments: Any) -> float:
-    """Time of one call, until its result is there."""
-    start = time.perf_counter()
-    jax.block_until_ready(run(*arguments))
-    return time.perf_counter() - start
 
 
 def main() -> None:

@@ -11,9 +11,6 @@ meshes. `gain` is the time of the step in float64 over that in mixed precision: 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable
-from typing import Any
 
 # Set before JAX is imported: one thread, so that the ratios are those of one core.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
@@ -23,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
+from benchmarks.timing import seconds
 from jaxbeam._tree import unlock
 from jaxbeam.linear import Layout, assemble
 from jaxbeam.newton import topology
@@ -33,13 +31,6 @@ factor, solve = jax.jit(LINEAR.factor), jax.jit(LINEAR.solve)
 # Refinements after which it is given up.
 MOST = 50
 MESHES = ((29, 7, 101), (57, 13, 51), (113, 25, 21), (225, 49, 7))
-
-
-def seconds(run: Callable[..., Any], *arguments: Any) -> float:
-    """Time of one call, until its result is there."""
-    start = time.perf_counter()
-    jax.block_until_ready(run(*arguments))
-    return time.perf_counter() - start
 
 
 @jax.jit

@@ -16,7 +16,7 @@ placeholders. Here unflattening bypasses it, so a constructor can validate what 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -133,6 +133,16 @@ def replace(tree: T, **changes: Any) -> T:
     new = object.__new__(type(tree))
     new.__dict__.update(tree.__dict__ | changes)
     return new
+
+
+def blank(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Zeros in the shape of what a function returns, which is traced and not run: a value to start a loop with."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
+
+
+def choose(condition: jax.Array, yes: T, no: T) -> T:
+    """One of two trees of the same structure, by a traced `()` boolean."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def is_concrete(*values: Any) -> bool:

@@ -202,7 +202,7 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
     # Inner product of displacements: mean square over the body's size.
     weight = 1 / (here.x.size * _size(scene) ** 2)
 
-    def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
+    def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Steps to balance at fixed s, and with s; residual and inertia."""
         scene_at = lambda s: command(scene, 1 + s * (end - 1))
         at = evaluate(scene_at(s), x)
@@ -212,11 +212,11 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
         gradient = gather(layout, at.gradient)
         solve = lambda v: expand(layout, -solver.linear.solve_indefinite(layout, factor, v), x.shape)
         residual = jnp.max(jnp.abs(gradient)) / force_scale(layout, storage, x, at, rtol)
-        return solve(gradient), solve(gather(layout, rate)), residual, negative, rate
+        return solve(gradient), solve(gather(layout, rate)), residual, negative
 
     def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:
         point, _ = carry
-        balance, along, residual, negative, _ = linearise(point.x, point.s)
+        balance, along, residual, negative = linearise(point.x, point.s)
         miss = weight * jnp.sum(here.dx * (point.x - here.x)) + here.ds * (point.s - here.s) - length
         ds = -(miss + weight * jnp.sum(here.dx * balance)) / (here.ds + weight * jnp.sum(here.dx * along))
         norm = jnp.sqrt(weight * jnp.sum(along**2) + 1)
@@ -263,9 +263,8 @@ def _locate(
         return float(modes.values[which]), modes.shapes[which]
 
     low, high = 0.0, length
-    f_low, f_high = eigen(old)[0], eigen(new)[0]
-    scale, side = max(abs(f_low), abs(f_high)), 0
-    point, value, shape = new, f_high, eigen(new)[1]
+    point, (f_low, _), (f_high, shape) = new, eigen(old), eigen(new)
+    scale, side, value = max(abs(f_low), abs(f_high)), 0, f_high
     for _ in range(60):
         middle = (low * f_high - high * f_low) / (f_high - f_low)
         point = advance(old, jnp.asarray(middle, old.s.dtype))

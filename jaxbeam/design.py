@@ -17,12 +17,12 @@ import numpy as np
 import optax
 from jax import lax
 
-from jaxbeam._tree import Numbers, is_concrete, pytree, replace
+from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace
 from jaxbeam.equilibrium import Solution, equilibrium
 from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
 from jaxbeam.newton import Newton, topology
-from jaxbeam.scene import Scene, tendon_terms
+from jaxbeam.scene import Scene, tendon_count
 from jaxbeam.search import History, Measure, Problem, Stand, search
 
 
@@ -135,7 +135,7 @@ def _problem(
     """The checked problem, and the commands `(S, m)` to start from."""
     check_held(scene)
     dtype = scene.mesh.nodes.dtype
-    count = sum(term.nodes.shape[0] for term in tendon_terms(scene))
+    count = tendon_count(scene)
     if not count:
         raise ValueError("scene: expected at least one tendon to command, got none")
     if tolerance is None:
@@ -179,8 +179,7 @@ def _reach(
         found = once(theta)
         solves = best.solves + found.solves
         better = (turn == 0) | ((found.status != DesignStatus.NOT_CONVERGED) & (found.loss < best.loss))
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
-        return turn + 1, found.theta, replace(best, solves=solves)
+        return turn + 1, found.theta, replace(choose(better, found, best), solves=solves)
 
     def going(carry: tuple[jax.Array, jax.Array, Design]) -> jax.Array:
         turn, _, best = carry
@@ -189,8 +188,7 @@ def _reach(
     def from_start(theta: jax.Array) -> Design:
         # What cannot be reached is searched once more from there, approached from rest: the search may have come
         # to it by way of a state that a beam pulled straight to it does not take.
-        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, theta))
-        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, blank))[2]
+        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, blank(once, theta)))[2]
 
     found = lax.map(from_start, begin)
     # The nearest; among those that reach the target the one of least effort.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Numbers, is_concrete, pytree, replace, unlock
+from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace, unlock
 from jaxbeam.held import check_held
 from jaxbeam.implicit import follow_scene
 from jaxbeam.linear import Layout, expand, gather
@@ -278,8 +278,7 @@ def follow(
     """
     count = jnp.zeros((), jnp.int32)
     rest = scene_at(targets[0])
-    one = jax.eval_shape(lambda: _report(rest, newton(rest, layout, x, count, count, solver), solver))
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), one)
+    empty = blank(lambda: _report(rest, newton(rest, layout, x, count, count, solver), solver))
     path = jax.tree.map(lambda leaf: jnp.zeros((targets.shape[0], *leaf.shape), leaf.dtype), empty)
     zero, no = jnp.zeros((), x.dtype), jnp.asarray(False)
     noise = jnp.asarray(np.random.default_rng(0).standard_normal(x.shape), x.dtype)
@@ -305,8 +304,8 @@ def follow(
         failed = ~good & ~saddle
         over = (~landed & spent_out) | (failed & ~may_cut)
 
-        s, x = _choose(good, (walk.trial, state.x), (walk.s, walk.x))
-        factor = _choose(good, state.factor, walk.factor)
+        s, x = choose(good, (walk.trial, state.x), (walk.s, walk.x))
+        factor = choose(good, state.factor, walk.factor)
         usable = jnp.where(good, state.definite, walk.usable)
         increment = jnp.where(good, 2 * walk.increment, jnp.where(saddle, walk.increment, 0.5 * (walk.trial - walk.s)))
         # A target reached at once invites to walk straight to the next one.
@@ -319,7 +318,7 @@ def follow(
 
         following = scene_at(trial)
         at = evaluate(following, x)
-        entry = _choose(over, _broken_off(following, found, x, at, s / jnp.where(target > 0, target, 1)), found)
+        entry = choose(over, _broken_off(following, found, x, at, s / jnp.where(target > 0, target, 1)), found)
         here = jnp.arange(targets.shape[0], dtype=jnp.int32)
         write = jnp.where(over, here >= walk.leg, landed & (here == walk.leg))
         path = jax.tree.map(lambda all, new: jnp.where(write.reshape(-1, *[1] * new.ndim), new, all), walk.path, entry)
@@ -327,7 +326,7 @@ def follow(
         # From a saddle along its soft modes, as the factor of the Hessian there filters them out of noise; else along
         # the tangent: the forces left unbalanced at x are the increment of the next scene.
         direction = jnp.where(saddle, noise, at.gradient)
-        chosen = _choose(saddle, state.factor, factor)
+        chosen = choose(saddle, state.factor, factor)
         step = expand(layout, -solver.linear.solve(layout, chosen, gather(layout, direction)), x.shape)
         step = jnp.where(saddle, ESCAPE * jnp.max(jnp.abs(x)) / jnp.max(jnp.abs(step)), 1.0) * step
         base = jnp.where(saddle, state.x, x)
@@ -344,7 +343,7 @@ def follow(
             increment=increment,
             cuts=jnp.where(landed & (found.status == 0), 0, walk.cuts + failed.astype(jnp.int32)),
             escapes=jnp.where(good, 0, walk.escapes + saddle.astype(jnp.int32)),
-            spent=_choose(landed, empty, found),
+            spent=choose(landed, empty, found),
             path=path,
             running=~over & ~(landed & (walk.leg == targets.shape[0] - 1)),
         )
@@ -406,7 +405,3 @@ def _broken_off(scene: Scene, found: Solution, x: jax.Array, at: Evaluation, rea
 def _add_counters(found: Solution, spent: Solution) -> Solution:
     names = ("steps", "projected", "halvings", "attempts")
     return replace(found, **{name: getattr(found, name) + getattr(spent, name) for name in names})
-
-
-def _choose(condition: jax.Array, yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Key
+from jaxbeam._tree import Key, blank, choose
 from jaxbeam.linear import BlockTridiagonal, Layout, LinearSolver, Topology, assemble, expand, gather
 from jaxbeam.linear import project_semidefinite as project
 from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
@@ -176,8 +176,7 @@ def correction(x: jax.Array, step: jax.Array) -> jax.Array:
 def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:
     """Zeros in the shape of a factor, to start a loop with."""
     storage = jax.ShapeDtypeStruct(layout.empty.shape, dtype)
-    factor, _ = jax.eval_shape(solver.linear.factor, layout, storage)
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), factor)
+    return blank(solver.linear.factor, layout, storage)[0]
 
 
 def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
@@ -263,5 +262,5 @@ def line_search(
     carry = (jnp.zeros((), jnp.int32), state.x, state.at, ~downhill)
     count, x, at, accepted = lax.while_loop(lambda c: ~c[3] & (c[0] <= MAX_HALVINGS), trial, carry)
     moved = downhill & accepted
-    keep = lambda new, old: jnp.where(moved, new, old)
-    return keep(x, state.x), jax.tree.map(keep, at, state.at), jnp.maximum(count - 1, 0), moved
+    x, at = choose(moved, (x, at), (state.x, state.at))
+    return x, at, jnp.maximum(count - 1, 0), moved

@@ -223,12 +223,7 @@ def curves(
                 linewidth=1.2,
                 label=", ".join(filter(None, names)),
             )
-    ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
-    if not ax.xaxis_inverted():
-        ax.invert_xaxis()
-    ax.grid(color="0.9", linewidth=0.6)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
+    _name_actuation_axes(ax, label)
     if len(ax.lines) > 1:
         ax.legend(frameon=False, fontsize="small")
     return ax
@@ -280,12 +275,7 @@ def branches(
             look |= {"marker": "D"} if each.kind == "bifurcation" else {"marker": "o", "markerfacecolor": "white"}
             ax.plot(along[place], values[place], **look)
             shown[each.kind] = Line2D([], [], label=each.kind, **look)
-    ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
-    if not ax.xaxis_inverted():
-        ax.invert_xaxis()
-    ax.grid(color="0.9", linewidth=0.6)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
+    _name_actuation_axes(ax, label)
     ax.legend(handles=list(shown.values()), frameon=False, fontsize="small")
     return ax
 
@@ -433,6 +423,16 @@ class _Beam:
         for number, (line, nodes, push) in enumerate(zip(self.tendons, self.paths, pushing, strict=True)):
             line.set_data(*x[nodes].T)
             line.set(linestyle=PUSHING if push else "-", label=f"tendon {number + 1}" + " (pushing)" * bool(push))
+
+
+def _name_actuation_axes(ax: Axes, label: str) -> None:
+    """Axes of a measure against actuation, which grows to the right as the ratio falls."""
+    ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
+    if not ax.xaxis_inverted():
+        ax.invert_xaxis()
+    ax.grid(color="0.9", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _polygons(scene: Scene) -> np.ndarray:

@@ -143,7 +143,7 @@ def command(scene: Scene, ratios: Numbers) -> Scene:
     Raises:
         ValueError: if the count is wrong or a concrete ratio is not positive and finite.
     """
-    count = sum(term.nodes.shape[0] for term in tendon_terms(scene))
+    count = tendon_count(scene)
     if np.shape(ratios) != (count,):
         raise ValueError(f"ratios: expected shape ({count},), one for each tendon, got {np.shape(ratios)}")
     if is_concrete(ratios):
@@ -202,6 +202,11 @@ def is_valid(scene: Scene) -> jax.Array:
 def tendon_terms(scene: Scene) -> list[Term]:
     """The terms that are tendons, in order; their tendons are numbered through."""
     return [term for term in scene.terms if isinstance(term.energy, TendonEnergy)]
+
+
+def tendon_count(scene: Scene) -> int:
+    """How many tendons there are to command."""
+    return sum(term.nodes.shape[0] for term in tendon_terms(scene))
 
 
 def solid_terms(scene: Scene) -> list[Term]:

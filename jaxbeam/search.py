@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxbeam._tree import pytree, replace, unlock
+from jaxbeam._tree import blank, choose, pytree, replace, unlock
 from jaxbeam.equilibrium import Solution, follow
 from jaxbeam.implicit import follow_scene
 from jaxbeam.linear import Layout
@@ -130,7 +130,7 @@ def search(
         cheaper = (far <= at.funnel) & (jnp.sum((1 - theta) ** 2) < jnp.sum((1 - at.theta) ** 2))
         taken = good & (first | nearer | cheaper)
         funnel = jnp.where(first, 0.1 * far, jnp.where(taken & ~nearer, 0.5 * at.funnel, at.funnel))
-        here = jax.tree.map(lambda new, old: jnp.where(taken, new, old), new, at)
+        here = choose(taken, new, at)
         scale = jnp.maximum(at.scale, jnp.where(taken, jnp.sum(new.slope**2), 0))
         radius = jnp.where(taken, jnp.minimum(RADIUS, 4 * at.radius), 0.25 * jnp.max(jnp.abs(at.step)))
         step, held = _program(here, problem, scale, radius)
@@ -149,10 +149,9 @@ def search(
         )
 
     zeros = lambda *shape: jnp.zeros(shape, dtype)
-    blank = jax.eval_shape(
+    nothing = blank(
         lambda: approach(unlock(problem.scene), problem.layout, theta, theta, x, zeros(*x.shape), solver)[0]
     )
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank)
     begin = Stand(
         theta=theta,
         solution=replace(nothing, x=x),
@@ -197,9 +196,10 @@ def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -
     free = jnp.where(at.held == 0, at.slope, 0)
     gram = free @ free.T + soft * jnp.eye(at.miss.size, dtype=soft.dtype)
     prices = jnp.stack([jnp.linalg.solve(gram, free @ (1 - at.theta)), at.miss / soft])
-    steep = 10 * jnp.linalg.norm(jnp.einsum("p,pij->ij", prices[0], at.bend)) / jnp.maximum(jnp.sum(at.slope**2), soft)
+    curvatures = jnp.einsum("qp,pij->qij", prices, at.bend)
+    steep = 10 * jnp.linalg.norm(curvatures[0]) / jnp.maximum(jnp.sum(at.slope**2), soft)
     weights = jnp.stack([steep, 1 / soft])
-    steps, helds = lax.map(lambda each: _box_program(at, each[0], each[1], low, high, soft), (prices, weights))
+    steps, helds = lax.map(lambda each: _box_program(at, each[0], each[1], low, high, soft), (curvatures, weights))
     left = jnp.linalg.norm(at.slope @ steps[0] + at.miss)
     best = jnp.where(left <= 0.5 * jnp.linalg.norm(at.miss), 0, 1)
     step, held = steps[best], helds[best]
@@ -209,17 +209,16 @@ def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -
 
 
 def _box_program(
-    at: Stand, price: jax.Array, weight: jax.Array, low: jax.Array, high: jax.Array, soft: jax.Array
+    at: Stand, curvature: jax.Array, weight: jax.Array, low: jax.Array, high: jax.Array, soft: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Step and active bounds of the quadratic program whose curvature is that of `price`.
+    """Step and active bounds of the quadratic program with a `curvature` `(m, m)` beside that of the effort.
 
-    What must be convex is its sum with `weight` times the squared slope, over the commands that no bound held last: the
-    target takes care of the rest.
+    What must be convex is their sum with `weight` times the squared slope, over the commands that no bound held last:
+    the target takes care of the rest.
     """
     m, p, dtype = at.theta.size, at.miss.size, at.theta.dtype
     free = at.held == 0
     square = weight * jnp.where(free[:, None] & free, at.slope.T @ at.slope, 0)
-    curvature = jnp.einsum("p,pij->ij", price, at.bend)
     whole = jnp.eye(m, dtype=dtype) + jnp.where(free[:, None] & free, curvature, 0) + square
     values, vectors = jnp.linalg.eigh(whole)
     convex = (vectors * jnp.maximum(jnp.abs(values), 0.01)) @ vectors.T - square

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Numbers, pytree, unlock
+from jaxbeam._tree import Numbers, blank, pytree, unlock
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand
 from jaxbeam.newton import Newton, topology
 from jaxbeam.scene import Scene, stencil_hessians
@@ -85,9 +85,8 @@ def lowest_pairs(layout: Layout, storage: jax.Array, count: int, linear: LinearS
         factor, done = linear.factor(layout, storage.at[layout.diagonal].add(shift))
         return tries + 1, shift, factor, done
 
-    first = jax.eval_shape(linear.factor, layout, storage)[0]
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
-    start = (jnp.zeros((), jnp.int32), jnp.zeros((), storage.dtype), blank, jnp.asarray(False))
+    no_factor = blank(linear.factor, layout, storage)[0]
+    start = (jnp.zeros((), jnp.int32), jnp.zeros((), storage.dtype), no_factor, jnp.asarray(False))
     _, shift, factor, _ = lax.while_loop(lambda c: ~c[3] & (c[0] < 80), grow, start)
     solve = jax.vmap(lambda column: linear.solve(layout, factor, column), in_axes=1, out_axes=1)
     unknown = (layout.slots < layout.position.size)[:, None]
