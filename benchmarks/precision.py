@@ -40,7 +40,7 @@ def product(scene: jb.Scene, layout: Layout, hessians: list[jax.Array], v: jax.A
     out = jnp.zeros_like(field)
     for term, hessian in zip(scene.terms, hessians, strict=True):
         where = (2 * term.nodes[..., None] + jnp.arange(2)).reshape(term.nodes.shape[0], -1)
-        out = out.at[where].add(jnp.einsum("mij,mj->mi", hessian, field[where]))
+        out = out.at[where].add(jnp.einsum("ijm,mj->mi", hessian, field[where]))
     return jnp.append(out, 0)[layout.slots]
 
 

@@ -6,7 +6,6 @@ Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuatio
 
 from jaxbeam.actuation import commands as commands
 from jaxbeam.actuation import ramp as ramp
-from jaxbeam.actuation import sweep as sweep
 from jaxbeam.branch import Branch as Branch
 from jaxbeam.branch import Critical as Critical
 from jaxbeam.branch import trace_branch as trace_branch
@@ -16,10 +15,6 @@ from jaxbeam.design import History as History
 from jaxbeam.design import minimise as minimise
 from jaxbeam.design import reach as reach
 from jaxbeam.design import reach_each as reach_each
-from jaxbeam.equilibrium import EquilibriumError as EquilibriumError
-from jaxbeam.equilibrium import Solution as Solution
-from jaxbeam.equilibrium import Status as Status
-from jaxbeam.equilibrium import check as check
 from jaxbeam.equilibrium import equilibrium as equilibrium
 from jaxbeam.linear import BlockTridiagonal as BlockTridiagonal
 from jaxbeam.linear import Dense as Dense
@@ -51,8 +46,13 @@ from jaxbeam.scene import forces as forces
 from jaxbeam.scene import reactions as reactions
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
 from jaxbeam.scene import tendon_beam as tendon_beam
+from jaxbeam.solution import EquilibriumError as EquilibriumError
+from jaxbeam.solution import Solution as Solution
+from jaxbeam.solution import Status as Status
+from jaxbeam.solution import check as check
 from jaxbeam.stability import Modes as Modes
 from jaxbeam.stability import lowest_mode as lowest_mode
+from jaxbeam.sweep import sweep as sweep
 from jaxbeam.terms import Term as Term
 from jaxbeam.terms import constant_stiffness as constant_stiffness
 from jaxbeam.terms import dead_load as dead_load

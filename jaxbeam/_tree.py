@@ -16,6 +16,8 @@ placeholders. Here unflattening bypasses it, so a constructor can validate what 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
@@ -121,7 +123,11 @@ def unlock(tree: T) -> T:
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         if field.metadata.get("kind") == "index":
-            value = jnp.asarray(value)
+            # Once an owner: a scene is commanded and solved again and again.
+            slot = "_device_" + field.name
+            if slot not in tree.__dict__:
+                tree.__dict__[slot] = to_device(value)
+            value = tree.__dict__[slot]
         elif "kind" not in field.metadata:
             value = unlock(value)
         object.__setattr__(new, field.name, value)
@@ -148,6 +154,55 @@ def choose(condition: jax.Array, yes: T, no: T) -> T:
 def is_concrete(*values: Any) -> bool:
     """True if no value is a tracer, so that checks on numbers can run on the host."""
     return not any(isinstance(value, Tracer) for value in values)
+
+
+def namespace(*values: Any) -> Any:
+    """NumPy if no value is a tracer, else `jax.numpy`: a scene of plain numbers is built without compiling anything."""
+    return np if is_concrete(*values) else jnp
+
+
+def to_device(values: Any, dtype: Any = None) -> jax.Array:
+    """A JAX array of plain numbers, or a JAX array itself, in JAX's dtype for them unless one is given.
+
+    `jnp.asarray` would compile a program for each shape it meets.
+    """
+    if isinstance(values, jax.Array):
+        return values if dtype in (None, values.dtype) else values.astype(dtype)
+    # Inside jit too these are constants, on which checks can run.
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(np.asarray(values, dtype))
+
+
+# XLA's newer CPU emitters take twice as long to compile the solver's many small kernels, which run no faster for it.
+COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if (0, 10) <= jax.__version_info__ < (0, 11) else None
+
+
+def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Decorator: `jax.jit` with static arguments of these names, for the solver's own entry points.
+
+    With concrete arguments the function runs at once, also inside a user's jit, where it is a constant; that is the
+    only place where compiler options may be given. With traced ones it is an ordinary jitted function, but under `vmap`
+    it solves lane after lane: batched, all lanes would do what any of them needs.
+    """
+
+    def decorate(function: Callable[..., T]) -> Callable[..., T]:
+        inner = jax.jit(function, static_argnames=static)
+        outermost = jax.jit(function, static_argnames=static, compiler_options=COMPILER_OPTIONS)
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> T:
+            values = signature.bind(*arguments, **named).arguments
+            settings = {name: values.pop(name) for name in static}
+            if is_concrete(*jax.tree.leaves(values)):
+                with jax.ensure_compile_time_eval():
+                    return outermost(**values, **settings)
+            in_turn = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))
+            return in_turn(values)
+
+        return call
+
+    return decorate
 
 
 def read_only(values: Any, dtype: Any = None) -> np.ndarray:

@@ -19,10 +19,11 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Numbers, unlock
-from jaxbeam.equilibrium import check, equilibrium
+from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
 from jaxbeam.newton import Newton, force_scale, topology
 from jaxbeam.scene import Scene, command, evaluate, smallest_jacobian, stencil_hessians
+from jaxbeam.solution import check
 from jaxbeam.stability import lowest_mode
 
 # Corrections per step; a step that needs more than a few is followed by a shorter one.

@@ -18,12 +18,13 @@ import optax
 from jax import lax
 
 from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace
-from jaxbeam.equilibrium import Solution, equilibrium
+from jaxbeam.equilibrium import equilibrium
 from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
 from jaxbeam.newton import Newton, topology
 from jaxbeam.scene import Scene, tendon_count
 from jaxbeam.search import History, Measure, Problem, Stand, search
+from jaxbeam.solution import Solution
 
 
 class DesignStatus(enum.IntEnum):

@@ -47,7 +47,7 @@ def check_held(scene: Scene) -> None:
             others, stencil_hessians(replace(scene, terms=others), scene.mesh.nodes), strict=True
         ):
             local = moved[term.nodes].reshape(len(term.nodes), -1, free.shape[1])
-            resistance += np.einsum("map,mab,mbq->pq", local, np.asarray(hessians, float), local)
+            resistance += np.einsum("map,abm,mbq->pq", local, np.asarray(hessians, float), local)
         values, vectors = np.linalg.eigh(resistance)
         free = free @ vectors[:, values <= 1e-9 * max(float(np.abs(values).max()), np.finfo(float).tiny)]
     if not free.shape[1]:

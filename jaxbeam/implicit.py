@@ -15,7 +15,8 @@ the loss does not look at (its cotangent is exactly zero) harms no other.
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -24,6 +25,23 @@ from jax import lax
 
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.scene import Scene, energy, stencil_hessians
+
+
+@lru_cache(maxsize=32)
+def _solve(linear: LinearSolver) -> Callable[[Layout, Any, jax.Array], jax.Array]:
+    """`linear.solve` that stays fast under `vmap`: right-hand sides of one factor become the columns of one, and those
+    of many factors are solved in turn, for batched triangular solves are slow."""
+    solve = jax.custom_batching.custom_vmap(linear.solve)
+
+    @solve.def_vmap
+    def _(size: int, batched: Any, layout: Layout, factor: Any, rhs: jax.Array) -> tuple[jax.Array, bool]:
+        if not any(jax.tree.leaves(batched[:2])) and rhs.ndim == 2:
+            return linear.solve(layout, factor, rhs.T).T, True
+        each = lambda leaf, many: leaf if many else jnp.broadcast_to(leaf, (size, *leaf.shape))
+        lanes = jax.tree.map(each, (layout, factor, rhs), tuple(batched))
+        return lax.map(lambda lane: solve(*lane), lanes), True
+
+    return solve
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -60,7 +78,7 @@ def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tupl
         return gather(layout, jax.jvp(lambda y: slope(scene, y), (at,), (expand(layout, v, x.shape),))[1])
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
-        y = linear.solve(layout, factor, b)
+        y = _solve(linear)(layout, factor, b)
         return jnp.where(trusted, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(y.dtype))
 
     # Fixed coordinates are at rest, and move with the rest positions.

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Key, pytree, static_field
+from jaxbeam._tree import Key, pytree, static_field, to_device
 
 
 def project_semidefinite(hessians: jax.Array) -> jax.Array:
@@ -45,8 +45,8 @@ class Layout:
 
     slots `(N,)`: flat coordinate (node * d + axis) of each unknown; the value `n d` marks padding.
     position `(n d,)`: unknown of each flat coordinate; the value `N` marks a fixed one.
-    scatter: for each term, `(m, (k d)^2)` places in the storage of its stencil Hessians; entries that are
-        fixed, or whose mirror image is stored, point past the end and are dropped.
+    scatter: for each term, `(s (s + 1) / 2, m)` places in the storage of the lower triangles of its stencil Hessians,
+        `s = k d`, row by row; entries that are fixed point past the end and are dropped.
     diagonal `(N,)`: places of the diagonal.
     empty `(size,)`: storage before assembly, as booleans: true on the diagonal of the padding.
     blocks: number of blocks, their width and that of the border.
@@ -69,7 +69,9 @@ class LinearSolver(Protocol):
         """Factor, and whether the matrix is positive definite to working precision."""
         ...
 
-    def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array: ...
+    def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array:
+        """Solution for `rhs` `(N,)`, or for each column of one `(N, k)`."""
+        ...
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[Any, jax.Array]:
         """Factor of a matrix of any inertia, and how many of its eigenvalues are negative."""
@@ -87,10 +89,11 @@ class Topology(NamedTuple):
 
 
 def assemble(layout: Layout, hessians: list[jax.Array]) -> jax.Array:
-    """Storage of the sum of stencil Hessians `(m, k d, k d)`, one array for each term."""
-    places = jnp.concatenate([s.ravel() for s in layout.scatter])
-    values = jnp.concatenate([h.ravel() for h in hessians])
-    return layout.empty.astype(values.dtype).at[places].add(values, mode="drop")
+    """Storage of the sum of stencil Hessians `(k d, k d, m)`, one array for each term."""
+    storage = layout.empty.astype(hessians[0].dtype)
+    for places, hessian in zip(layout.scatter, hessians, strict=True):
+        storage = storage.at[places].add(hessian[np.tril_indices(len(hessian))], mode="drop")
+    return storage
 
 
 def gather(layout: Layout, field: jax.Array) -> jax.Array:
@@ -119,12 +122,13 @@ class Dense:
         return factor, jnp.isfinite(factor[-1, -1])
 
     def solve(self, layout: Layout, factor: jax.Array, rhs: jax.Array) -> jax.Array:
-        half = lax.linalg.triangular_solve(factor, rhs[:, None], left_side=True, lower=True)
-        return lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
+        half = lax.linalg.triangular_solve(factor, rhs.reshape(len(rhs), -1), left_side=True, lower=True)
+        whole = lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)
+        return whole.reshape(rhs.shape)
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array]:
         size = layout.blocks[1]
-        return _inverse(storage.reshape(size, size))
+        return _inverse(_mirrored(storage.reshape(size, size)))
 
     def solve_indefinite(self, layout: Layout, factor: jax.Array, rhs: jax.Array) -> jax.Array:
         return factor @ rhs
@@ -140,8 +144,7 @@ def _dense_layout(topology: Topology) -> Layout:
     scatter = []
     for stencil in topology.stencils:
         rows, columns = _stencil_pairs(position[_coordinates(stencil.array, topology)])
-        keep = (rows < size) & (columns < size)
-        scatter.append(np.where(keep, rows * size + columns, size * size))
+        scatter.append(np.where(rows < size, rows * size + columns, size * size))
     return _device_layout(
         slots, position, scatter, np.arange(size) * (size + 1), np.zeros(size * size, bool), (1, size, 0)
     )
@@ -194,28 +197,33 @@ class BlockTridiagonal:
 
     def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
         b, w, r = layout.blocks
-        inner, outer = rhs[: b * w].reshape(b, w, 1), rhs[b * w :, None]
+        # Right-hand sides are rows here, so that the products below can be plain loops.
+        k = rhs.size // len(rhs)
+        inner, outer = rhs[: b * w].reshape(b, w, k).swapaxes(1, 2), rhs[b * w :].reshape(r, k)
+        solve = lambda pivot, y, transpose: lax.linalg.triangular_solve(
+            pivot, y.T, left_side=True, lower=True, transpose_a=transpose
+        ).T
 
         def forward(above: jax.Array, block: Any) -> Any:
             pivot, lower, right = block
-            y = lax.linalg.triangular_solve(pivot, right - lower @ above, left_side=True, lower=True)
+            y = solve(pivot, right - _times(above, lower.T), False)
             return y, y
 
-        _, inner = lax.scan(forward, jnp.zeros((w, 1), rhs.dtype), (factor.pivot, factor.lower, inner))
+        start = jnp.zeros((k, w), rhs.dtype)
+        _, inner = lax.scan(forward, start, (factor.pivot, factor.lower, inner))
         if r:
-            outer = outer - jnp.einsum("bwr,bwc->rc", factor.border, inner)
+            outer = outer - jnp.einsum("bwr,bkw->rk", factor.border, inner)
             outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True)
             outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True, transpose_a=True)
-            inner = inner - factor.border @ outer
+            inner = inner - jnp.einsum("bwr,rk->bkw", factor.border, outer)
 
         def backward(carry: jax.Array, block: Any) -> Any:
             pivot, lower, right = block
-            y = lax.linalg.triangular_solve(pivot, right - carry, left_side=True, lower=True, transpose_a=True)
-            return lower.T @ y, y
+            y = solve(pivot, right - carry, True)
+            return _times(y, lower), y
 
-        start = jnp.zeros((w, 1), rhs.dtype)
         _, inner = lax.scan(backward, start, (factor.pivot, factor.lower, inner), reverse=True)
-        return jnp.concatenate([inner.reshape(b * w), outer.reshape(r)])
+        return jnp.concatenate([inner.swapaxes(1, 2).reshape(b * w, k), outer]).reshape(rhs.shape)
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
         """Block `L D L^T` with the pivots `D` inverted through their eigenvalues.
@@ -229,13 +237,13 @@ class BlockTridiagonal:
             above, border_above, schur, count = carry
             diagonal, lower, border = block
             ahead = lower @ above
-            inverse, negative = _inverse(diagonal - ahead @ lower.T)
+            inverse, negative = _inverse(_mirrored(diagonal) - ahead @ lower.T)
             border = border - ahead @ border_above
             schur = schur - border.T @ inverse @ border
             return (inverse, border, schur, count + negative), (inverse, border)
 
         zeros = jnp.zeros((w, w + r), storage.dtype)
-        carry = (zeros[:, :w], zeros[:, w:], corner, jnp.zeros((), jnp.int32))
+        carry = (zeros[:, :w], zeros[:, w:], _mirrored(corner), jnp.zeros((), jnp.int32))
         (_, _, schur, count), (inverse, border) = lax.scan(eliminate, carry, (diagonal, lower, border))
         corner, negative = _inverse(schur)
         return BorderedFactor(inverse, lower, border, corner), count + negative
@@ -268,6 +276,22 @@ def _pieces(layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array, j
     b, w, r = layout.blocks
     diagonal, lower, border, corner = jnp.split(storage, np.cumsum([b * w * w, b * w * w, b * w * r]))
     return diagonal.reshape(b, w, w), lower.reshape(b, w, w), border.reshape(b, w, r), corner.reshape(r, r)
+
+
+# Up to this width a loop is faster than a call of a matrix product.
+LOOPED = 64
+
+
+def _times(rows: jax.Array, matrix: jax.Array) -> jax.Array:
+    """The product of a few rows `(k, w)` with a square matrix."""
+    if len(matrix) > LOOPED:
+        return rows @ matrix
+    return jnp.sum(rows[:, :, None] * matrix, axis=1)
+
+
+def _mirrored(matrix: jax.Array) -> jax.Array:
+    """A symmetric matrix of which the lower triangle is stored."""
+    return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 
 
 def _inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -311,19 +335,14 @@ def _bordered_layout(topology: Topology) -> Layout:
     scatter = []
     for stencil in topology.stencils:
         p, q = _stencil_pairs(position[_coordinates(stencil.array, topology)])
-        place = np.full(p.shape, total)
-        known = (p < size) & (q < size)
-        p_in, q_in = known & (p < b * w), known & (q < b * w)
         bp, bq, sp, sq = p // w, q // w, p % w, q % w
-        both = p_in & q_in
-        same, below = both & (bp == bq), both & (bp == bq + 1)
-        if (both & (abs(bp - bq) > 1)).any():
+        inside = p < b * w
+        if (inside & (bp - bq > 1)).any():
             raise AssertionError("a stencil couples blocks that are not neighbours")
-        place = np.where(same, (bp * w + sp) * w + sq, place)
-        place = np.where(below, lower_at + (bp * w + sp) * w + sq, place)
-        place = np.where(p_in & known & ~q_in, border_at + p * r + (q - b * w), place)
-        place = np.where(known & ~p_in & ~q_in, corner_at + (p - b * w) * r + (q - b * w), place)
-        scatter.append(place)
+        place = np.where(bp == bq, 0, lower_at) + (bp * w + sp) * w + sq
+        place = np.where(inside, place, border_at + q * r + (p - b * w))
+        place = np.where(q < b * w, place, corner_at + (p - b * w) * r + (q - b * w))
+        scatter.append(np.where(p < size, place, total))
     inner_slot = np.arange(b * w)
     diagonal = np.concatenate([inner_slot * w + inner_slot % w, corner_at + np.arange(r) * (r + 1)])
     empty = np.zeros(total, bool)
@@ -432,9 +451,11 @@ def _coordinates(stencil: np.ndarray, topology: Topology) -> np.ndarray:
 
 
 def _stencil_pairs(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column unknown `(m, s^2)` of each entry of stencil Hessians, from their unknowns `(m, s)`."""
-    s = unknowns.shape[1]
-    return np.repeat(unknowns, s, axis=1), np.tile(unknowns, (1, s))
+    """Row and column `(m, s (s + 1) / 2)` in the lower triangle of the matrix of each entry in the lower triangle of
+    stencil Hessians, from their unknowns `(m, s)`."""
+    i, j = np.tril_indices(unknowns.shape[1])
+    a, b = unknowns[:, i], unknowns[:, j]
+    return np.maximum(a, b), np.minimum(a, b)
 
 
 def _device_layout(
@@ -449,8 +470,7 @@ def _device_layout(
         raise ValueError(
             f"mesh: its factor would hold {empty.size} numbers, more than 32-bit indices address; use a coarser mesh"
         )
-    to_device = lambda a: jnp.asarray(a, jnp.int32)
     # Cached across calls, so it must not be a tracer of the call that made it.
     with jax.ensure_compile_time_eval():
-        places = tuple(to_device(s) for s in scatter)
-        return Layout(to_device(slots), to_device(position), places, to_device(diagonal), jnp.asarray(empty), blocks)
+        where = [to_device(a.astype(np.int32)) for a in (slots, position, diagonal, *(s.T for s in scatter))]
+        return Layout(where[0], where[1], tuple(where[3:]), where[2], to_device(empty), blocks)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, is_concrete, pytree
+from jaxbeam._tree import Numbers, is_concrete, namespace, pytree, to_device
 
 
 @pytree
@@ -38,8 +38,10 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
     """
     _check_range("young", young, 0.0, np.inf, "a stiffness is positive")
     _check_range("poisson", poisson, -1.0, 0.5, "0.5 is incompressible, where lam is infinite: use 0.4999, say")
-    young, poisson = jnp.asarray(young, float), jnp.asarray(poisson, float)
-    return Lame(young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson)))
+    xp, dtype = namespace(young, poisson), jnp.result_type(float)
+    young, poisson = xp.asarray(young, dtype), xp.asarray(poisson, dtype)
+    mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    return Lame(to_device(mu), to_device(lam))
 
 
 def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:
@@ -108,7 +110,8 @@ def saint_venant_kirchhoff(H: jax.Array, params: Lame) -> jax.Array:
 
     Source: Bonet and Wood 2008, eq. 6.28.
     """
-    strain = 0.5 * (H + H.T + H.T @ H)
+    # Not H.T @ H: a product of small matrices, one for each element, is far slower than its loops.
+    strain = 0.5 * (H + H.T + jnp.sum(H[:, :, None] * H[:, None, :], axis=0))
     return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
 
 

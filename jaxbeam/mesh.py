@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, to_device
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
 
@@ -50,7 +50,7 @@ class Mesh:
         _check_topology(nodes.shape[0], elements)
         if is_concrete(nodes):
             _check_geometry(np.asarray(nodes, dtype=np.float64), elements)
-        object.__setattr__(self, "nodes", jnp.asarray(nodes))
+        object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
 
 
@@ -116,8 +116,9 @@ def rectangle(
     elements = np.stack([np.stack(t, axis=1) for t in triangles], axis=1).reshape(-1, 3)
     if dtype is None:
         dtype = jnp.result_type(float)
-    extent = jnp.stack([jnp.asarray(length, dtype), jnp.asarray(height, dtype)])
-    return Mesh(jnp.asarray(unit, dtype) * extent, elements)
+    xp = namespace(length, height)
+    extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
+    return Mesh(xp.asarray(unit, dtype) * extent, elements)
 
 
 def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:

@@ -12,6 +12,7 @@ Forces smaller than round-off can tell apart count as balanced: see `force_scale
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -82,11 +83,16 @@ def topology(scene: Scene) -> Topology:
     return Topology(Key(scene.mesh.elements), Key(scene.fixed), tuple(Key(term.nodes) for term in scene.terms))
 
 
+# What `State.counts` counts.
+STEPS, PROJECTED, HALVINGS, POLISHED = range(4)
+
+
 class State(NamedTuple):
     """Where Newton's method stands.
 
     `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so; `marginal` if a
-    shift by no more than round-off did it, which leaves its sign open. `step` is the step to take next.
+    shift by no more than round-off did it, which leaves its sign open. `step` `(n, 2)` is the step to take next and
+    `aside` `(k, n, 2)` how `x` would move under the probes.
     """
 
     x: jax.Array
@@ -95,72 +101,77 @@ class State(NamedTuple):
     definite: jax.Array
     marginal: jax.Array
     step: jax.Array
+    aside: jax.Array
     residual: jax.Array
-    steps: jax.Array
-    projected: jax.Array
-    halvings: jax.Array
-    polished: jax.Array
+    counts: jax.Array
     fresh: jax.Array
     running: jax.Array
 
 
-def newton(scene: Scene, layout: Layout, x: jax.Array, budget: jax.Array, free: jax.Array, solver: Newton) -> State:
-    """Newton's method from `x`, for a scene with unlocked indices; to be called inside jit.
+def newton(
+    scene: Scene,
+    layout: Layout,
+    x: jax.Array,
+    ahead: jax.Array,
+    budget: jax.Array,
+    free: jax.Array,
+    probes: Callable[[jax.Array], jax.Array],
+    solver: Newton,
+) -> State:
+    """Newton's method from `x + ahead`, for a scene with unlocked indices; to be called inside jit.
 
-    Takes at most `budget` steps. The first `free` of them need not lower the energy, as long as the true
-    Hessian is positive definite. The state it ends in holds the factor of the Hessian at `x`.
+    It starts as far along `ahead` as no element inverts, and takes at most `budget` steps. The first `free` of them
+    need not lower the energy, as long as the true Hessian is positive definite. The state it ends in holds the factor
+    of the Hessian at `x`. `probes(x)` are nodal forces `(k, n, 2)` that are solved for beside the unbalanced ones: a
+    column more costs next to nothing.
     """
     rtol = solver.tolerance(x.dtype)
-    zero, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(x)
-    count, yes = jnp.zeros((), jnp.int32), jnp.asarray(True)
+    zero, nothing, yes = jnp.zeros((), x.dtype), jnp.zeros_like(x), jnp.asarray(True)
     first = State(
         x=x,
         at=Evaluation(zero, zero, nothing, nothing),
         factor=no_factor(layout, x.dtype, solver),
         definite=yes,
         marginal=~yes,
-        step=nothing,
+        step=ahead,
+        aside=blank(probes, x),
         residual=jnp.asarray(jnp.inf, x.dtype),
-        steps=count,
-        projected=count,
-        halvings=count,
-        polished=count,
+        counts=jnp.zeros(4, jnp.int32),
         fresh=yes,
         running=yes,
     )
 
     def body(state: State) -> State:
-        x, at, halvings, moved = line_search(
-            scene, state, state.fresh | (state.definite & (state.steps < free)), solver
-        )
+        bold = state.fresh | (state.definite & (state.counts[STEPS] < free))
+        x, at, halvings, moved = line_search(scene, state, bold, solver)
         hessians = stencil_hessians(scene, x)
         storage = assemble(layout, hessians)
-        gradient = gather(layout, at.gradient)
-        unbalanced = jnp.max(jnp.abs(gradient))
+        unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, at.gradient)))
         residual = unbalanced / force_scale(layout, storage, x, at, rtol)
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
         rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
-        taken = (moved & ~state.fresh).astype(jnp.int32)
-        factor, definite = solver.linear.factor(layout, storage)
-        factor, marginal = convexify(layout, hessians, storage, factor, definite | ~jnp.isfinite(residual), solver)
-        step = expand(layout, -solver.linear.solve(layout, factor, gradient), x.shape)
+        factor, definite, marginal = factorise(layout, hessians, storage, jnp.isfinite(residual), solver)
+        pulls = jnp.concatenate([at.gradient[None], probes(x)])
+        moves = solver.linear.solve(layout, factor, jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls))
+        moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
         # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
         # mode, and it rounds anew with each step.
-        vague = (residual <= rtol) & (correction(x, step) > INACCURATE) & (state.polished < POLISH)
+        vague = (residual <= rtol) & (correction(x, moves[0]) > INACCURATE) & (state.counts[POLISHED] < POLISH)
+        taken = moved & ~state.fresh
+        counted = jnp.stack([taken, taken & ~state.definite, halvings, vague], dtype=jnp.int32)
+        counts = state.counts + counted
         # False for NaN: there is nothing to go on from.
-        wanted = ((residual > rtol) | rough | vague) & (state.steps + taken < budget)
+        wanted = ((residual > rtol) | rough | vague) & (counts[STEPS] < budget)
         return State(
             x=x,
             at=at,
             factor=factor,
             definite=definite,
             marginal=marginal,
-            step=step,
+            step=moves[0],
+            aside=moves[1:],
             residual=residual,
-            steps=state.steps + taken,
-            projected=state.projected + jnp.where(state.definite, 0, taken),
-            halvings=state.halvings + halvings,
-            polished=state.polished + vague.astype(jnp.int32),
+            counts=counts,
             fresh=~yes,
             running=moved & wanted,
         )
@@ -192,42 +203,42 @@ def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation
     return jnp.max(at.gradient_scale) + round_off / rtol
 
 
-def convexify(
-    layout: Layout, hessians: list[jax.Array], storage: jax.Array, factor: Any, done: jax.Array, solver: Newton
-) -> tuple[Any, jax.Array]:
-    """A positive definite factor where the true one failed: the true Hessian blended with the projected one.
+def factorise(
+    layout: Layout, hessians: list[jax.Array], storage: jax.Array, finite: jax.Array, solver: Newton
+) -> tuple[Any, jax.Array, jax.Array]:
+    """A positive definite factor: of the true Hessian if it has one, else of one blended with the projected one.
 
-    The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along
-    the soft modes of a snap. A projected one that is singular is shifted as well. Returned with it is whether
-    the true Hessian had one after a shift by its own round-off, which is tried first.
+    The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along the soft
+    modes of a snap. A projected one that is singular is shifted as well. Returned with it is whether the factor is that
+    of the true Hessian, and whether it is so after a shift by round-off, which is tried first. One that is not `finite`
+    is tried once.
     """
     stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
     round_off = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5 * stiffness
-    no = jnp.zeros_like(done)
 
-    def search(carry: tuple[Any, jax.Array, jax.Array]) -> tuple[Any, jax.Array, jax.Array]:
-        # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would
-        # be computed in every Newton step, needed or not.
-        (factor, done, _), stencils = lax.optimization_barrier((carry, hessians))
-        convex = assemble(layout, [project(h) for h in stencils])
+    def project_all(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would be computed
+        # in every Newton step, needed or not.
+        _, stencils = lax.optimization_barrier((carry, hessians))
+        convex = [jnp.moveaxis(project(jnp.moveaxis(h, -1, 0)), 0, -1) for h in stencils]
+        return assemble(layout, convex), jnp.zeros((), bool)
 
-        def attempt(carry: Any) -> Any:
-            tries, _, _ = carry
-            count = tries.astype(storage.dtype)
-            share = jnp.where(tries > 0, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 1)), 0.0)
-            shift = jnp.where(share < 1, jnp.where(tries > 0, 0, round_off), stiffness * 10.0 ** (count - 17))
-            blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(shift)
-            factor, done = solver.linear.factor(layout, blend)
-            return tries + 1, factor, done
+    def attempt(carry: Any) -> Any:
+        tries, _, _, convex = carry
+        # A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would
+        # always pay.
+        convex, _ = lax.while_loop(lambda c: c[1], project_all, (convex, tries == 2))
+        count = tries.astype(storage.dtype)
+        share = jnp.where(tries > 1, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 2)), 0.0)
+        more = jnp.where(share < 1, 0.0, 10.0 ** (count - 18)) * stiffness
+        blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(jnp.where(tries == 1, round_off, more))
+        factor, done = solver.linear.factor(layout, blend)
+        return tries + 1, factor, done, convex
 
-        begin = (jnp.zeros((), jnp.int32), factor, done)
-        tries, factor, found = lax.while_loop(lambda c: ~c[2] & (c[0] <= MAX_BLENDS), attempt, begin)
-        return factor, jnp.ones_like(done), found & (tries == 1)
-
-    # A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would
-    # always pay.
-    factor, _, marginal = lax.while_loop(lambda c: ~c[1], search, (factor, done, no))
-    return factor, marginal
+    begin = (jnp.zeros((), jnp.int32), no_factor(layout, storage.dtype, solver), ~finite, jnp.zeros_like(storage))
+    going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] <= MAX_BLENDS + 1))
+    tries, factor, done, _ = lax.while_loop(going, attempt, begin)
+    return factor, done & (tries == 1), done & (tries == 2)
 
 
 def line_search(
@@ -237,8 +248,8 @@ def line_search(
 
     Near the solution differences of energy drown in round-off. There the slope decides: the approximate
     Wolfe condition of Hager and Zhang (2005), SIAM J. Optim. 16, eq. 4.1, holds for an energy that rises
-    by no more than its round-off. A `free` step is taken at full length; a fresh state has none to take, and
-    is only evaluated.
+    by no more than its round-off. A `free` step is taken at full length, and so is that of a fresh state, which
+    leads to where Newton's method starts.
     """
     step = state.step
     slope = jnp.sum(state.at.gradient * step)

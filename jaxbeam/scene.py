@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only, replace
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, rectangle
+from jaxbeam.stencils import stencil_gradients, stencil_hessian
 from jaxbeam.terms import (
     SolidEnergy,
     TendonEnergy,
@@ -153,12 +154,13 @@ def command(scene: Scene, ratios: Numbers) -> Scene:
                 f"ratios: expected positive finite numbers, got {array.tolist()}; 1 is the natural length and "
                 f"0.5 half of it"
             )
-    values = jnp.asarray(ratios, scene.mesh.nodes.dtype)
     terms, start = [], 0
     for term in scene.terms:
         if isinstance(term.energy, TendonEnergy):
-            stop = start + term.nodes.shape[0]
-            params = replace(term.params, commanded=values[start:stop] * term.params.natural)
+            stop, natural = start + term.nodes.shape[0], term.params.natural
+            xp = namespace(ratios, natural)
+            commanded = xp.asarray(ratios, natural.dtype)[start:stop] * xp.asarray(natural)
+            params = replace(term.params, commanded=to_device(commanded))
             term, start = replace(term, params=params), stop
         terms.append(term)
     return replace(scene, terms=tuple(terms))
@@ -234,7 +236,7 @@ def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
     energy = energy_scale = jnp.zeros((), x.dtype)
     both = jnp.zeros((*x.shape, 2), x.dtype)
     for term in scene.terms:
-        energies, gradients = jax.vmap(jax.value_and_grad(term.energy))(x[term.nodes], term.params)
+        energies, gradients = stencil_gradients(term, x)
         energy += jnp.sum(energies)
         energy_scale += jnp.sum(jnp.abs(energies))
         both = both.at[term.nodes].add(jnp.stack([gradients, jnp.abs(gradients)], axis=-1))
@@ -261,13 +263,8 @@ def reactions(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def stencil_hessians(scene: Scene, x: jax.Array) -> list[jax.Array]:
-    """For each term, the `(m, k d, k d)` Hessians of its stencils, by autodiff."""
-
-    def hessian(term: Term, positions: jax.Array, params: Any) -> jax.Array:
-        shape = positions.shape
-        return jax.hessian(lambda flat: term.energy(flat.reshape(shape), params))(positions.ravel())
-
-    return [jax.vmap(lambda p, q, t=t: hessian(t, p, q))(x[t.nodes], t.params) for t in scene.terms]
+    """For each term, the `(k d, k d, m)` Hessians of its stencils, by autodiff."""
+    return [stencil_hessian(term, x) for term in scene.terms]
 
 
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:

@@ -8,19 +8,20 @@ derivative, exact, from the factor of the one solve that each step costs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxbeam._tree import blank, choose, pytree, replace, unlock
-from jaxbeam.equilibrium import Solution, follow
+from jaxbeam._tree import blank, choose, compiled, pytree, replace, unlock
+from jaxbeam.follow import follow
 from jaxbeam.implicit import follow_scene
 from jaxbeam.linear import Layout
 from jaxbeam.newton import Newton
-from jaxbeam.scene import Scene, command, largest_step
+from jaxbeam.predictor import begin
+from jaxbeam.scene import Scene, command
+from jaxbeam.solution import Solution
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
 
@@ -72,7 +73,7 @@ class Stand(NamedTuple):
     history: History
 
 
-@partial(jax.jit, static_argnames="solver")
+@compiled("solver")
 def approach(
     scene: Scene, layout: Layout, before: jax.Array, theta: jax.Array, x: jax.Array, ahead: jax.Array, solver: Newton
 ) -> tuple[Solution, Any]:
@@ -82,9 +83,7 @@ def approach(
     that it is traced once however often it is used.
     """
     way = lambda s: command(scene, (1 - s) * before + s * theta)
-    one = jnp.ones((), x.dtype)
-    length = jnp.minimum(one, largest_step(way(one), x, ahead, solver.keep_volume)).astype(x.dtype)
-    path, factor = follow(way, layout, x + length * ahead, one[None], solver, origin=x)
+    path, factor, _ = follow(way, layout, begin(x, ahead), jnp.ones(1, x.dtype), solver)
     return jax.tree.map(lambda leaf: leaf[0], path), factor
 
 

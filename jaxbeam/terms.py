@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, index_field, is_concrete, pytree, read_only, static_field
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, static_field, to_device
 from jaxbeam.materials import macklin_mueller
 from jaxbeam.mesh import Mesh
 
@@ -49,7 +49,7 @@ class Term:
             got = "a traced array" if nodes is None else f"shape {nodes.shape} of dtype {nodes.dtype}"
             raise ValueError(f"nodes: expected concrete whole numbers of shape (m, k), got {got}")
         object.__setattr__(self, "nodes", read_only(nodes, np.int32))
-        params = jax.tree.map(jnp.asarray, self.params)
+        params = jax.tree.map(to_device, self.params)
         for path, leaf in jax.tree_util.tree_leaves_with_path(params):
             if leaf.ndim == 0 or leaf.shape[0] != nodes.shape[0]:
                 raise ValueError(
@@ -89,10 +89,10 @@ class SolidEnergy:
 
 def forbids_inversion(energy: SolidEnergy, params: SolidParams) -> bool:
     """Whether the density is infinite or undefined for an inverted element, as a logarithmic one is."""
+    ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
+    inverted = np.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
     with jax.ensure_compile_time_eval():
-        ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
-        inverted = jnp.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
-        return not bool(jnp.isfinite(energy.density(inverted, ones)))
+        return not np.isfinite(jax.jit(energy.density)(inverted, ones))
 
 
 def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
@@ -142,11 +142,12 @@ def solid(
         ValueError: if a parameter is neither a scalar nor of leading axis `t`.
     """
     count, dtype = mesh.elements.shape[0], mesh.nodes.dtype
+    xp = namespace(mesh.nodes, *jax.tree.leaves(params))
 
     def per_element(path: Any, value: Numbers) -> jax.Array:
-        array = jnp.asarray(value, dtype)
+        array = xp.asarray(value, dtype)
         if array.ndim == 0:
-            return jnp.full((count,), array)
+            return xp.full((count,), array)
         if array.shape[0] != count:
             raise ValueError(
                 f"params{jax.tree_util.keystr(path)}: expected a scalar or {count} entries, one for each triangle, "
@@ -155,13 +156,13 @@ def solid(
         return array
 
     material = jax.tree_util.tree_map_with_path(per_element, params)
-    rest = mesh.nodes[mesh.elements]
+    rest = xp.asarray(mesh.nodes)[mesh.elements]
     first, second = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
     twice_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     # Gradients of the barycentric coordinates: rows of the inverse of the edge matrix, and minus their sum.
-    g1 = jnp.stack([second[:, 1], -second[:, 0]], axis=1) / twice_area[:, None]
-    g2 = jnp.stack([-first[:, 1], first[:, 0]], axis=1) / twice_area[:, None]
-    gradients = jnp.stack([-(g1 + g2), g1, g2], axis=1)[:, None]
+    g1 = xp.stack([second[:, 1], -second[:, 0]], axis=1) / twice_area[:, None]
+    g2 = xp.stack([-first[:, 1], first[:, 0]], axis=1) / twice_area[:, None]
+    gradients = xp.stack([-(g1 + g2), g1, g2], axis=1)[:, None]
     return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, 0.5 * twice_area[:, None], material))
 
 
@@ -213,13 +214,14 @@ class TendonEnergy:
 
 
 def polyline_length(x: jax.Array) -> jax.Array:
-    """Length of the line through the points `x` `(k, 2)`.
+    """Length `(...)` of the line through the points `x` `(..., k, 2)`.
 
     Where two neighbours meet the length has no derivative; there it and every higher one is zero, not NaN.
     """
-    squared = jnp.sum((x[1:] - x[:-1]) ** 2, axis=-1)
+    xp = namespace(x)
+    squared = xp.sum((x[..., 1:, :] - x[..., :-1, :]) ** 2, axis=-1)
     apart = squared > 0
-    return jnp.sum(jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1)), 0))
+    return xp.sum(xp.where(apart, xp.sqrt(xp.where(apart, squared, 1)), 0), axis=-1)
 
 
 def tendons(
@@ -255,8 +257,9 @@ def tendons(
             raise ValueError(f"modulus: expected positive finite numbers, got {modulus!r}")
     if np.shape(modulus) not in ((), (lines.shape[0],)):
         raise ValueError(f"modulus: expected a scalar or {lines.shape[0]} entries, got shape {np.shape(modulus)}")
-    natural = jax.vmap(polyline_length)(mesh.nodes[lines])
-    moduli = jnp.broadcast_to(jnp.asarray(modulus, mesh.nodes.dtype), natural.shape)
+    natural = polyline_length(namespace(mesh.nodes).asarray(mesh.nodes)[lines])
+    xp = namespace(modulus)
+    moduli = xp.broadcast_to(xp.asarray(modulus, mesh.nodes.dtype), natural.shape)
     return Term(TendonEnergy(stiffness), lines, TendonParams(natural, natural, moduli))
 
 
@@ -297,8 +300,9 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
         raise ValueError(f"force: expected shape (2,) or ({where.size}, 2), got {np.shape(force)}")
     if is_concrete(force) and not np.isfinite(np.asarray(force)).all():
         raise ValueError(f"force: expected finite numbers, got {force!r}")
-    values = jnp.broadcast_to(jnp.asarray(force, mesh.nodes.dtype), (where.size, 2))
-    return Term(dead_load_energy, where[:, None], PointParams(mesh.nodes[where], values))
+    xp, rest = namespace(force), namespace(mesh.nodes).asarray(mesh.nodes)[where]
+    values = xp.broadcast_to(xp.asarray(force, mesh.nodes.dtype), (where.size, 2))
+    return Term(dead_load_energy, where[:, None], PointParams(rest, values))
 
 
 def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
@@ -322,8 +326,9 @@ def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
         array = np.asarray(stiffness, float)
         if not (np.isfinite(array) & (array >= 0)).all():
             raise ValueError(f"stiffness: expected finite numbers of at least 0, got {stiffness!r}")
-    values = jnp.broadcast_to(jnp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
-    return Term(penalty_energy, where[:, None], PointParams(mesh.nodes[where], values))
+    xp, rest = namespace(stiffness), namespace(mesh.nodes).asarray(mesh.nodes)[where]
+    values = xp.broadcast_to(xp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
+    return Term(penalty_energy, where[:, None], PointParams(rest, values))
 
 
 def check_nodes(name: str, mesh: Mesh, nodes: Numbers, ndim: int) -> np.ndarray:

@@ -154,11 +154,11 @@ def central_difference(f, x: np.ndarray, h: float) -> np.ndarray:
 
 
 def assembled(topology: Topology, hessians: list[np.ndarray]) -> np.ndarray:
-    """Matrix over all coordinates of a sum of stencil matrices, entry by entry in NumPy."""
+    """Matrix over all coordinates of a sum of stencil matrices, entry by entry in NumPy. One `(s, s, m)` array for each stencil."""
     size = topology.fixed.array.size
     matrix = np.zeros((size, size))
     for stencil, hessian in zip(topology.stencils, hessians, strict=True):
-        for nodes, block in zip(stencil.array, np.asarray(hessian), strict=True):
+        for nodes, block in zip(stencil.array, np.moveaxis(hessian, -1, 0), strict=True):
             places = (2 * nodes[:, None] + np.arange(2)).ravel()
             np.add.at(matrix, np.ix_(places, places), block)
     return matrix

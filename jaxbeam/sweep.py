@@ -1,0 +1,290 @@
+"""Many commands at once.
+
+A sweep repeats work: neighbours differ by little. So each command is continued from the nearest one solved already, as
+far as their tangents lead (`jaxbeam.predictor`), and one or two Newton steps are left to take where a solve from rest
+takes ten or twenty.
+
+Commands are parted into chunks of near ones, by a rule that depends on nothing but the commands and the scene. A chunk
+is one call of one compiled program, whatever their number, which goes through its commands from rest outward. Chunks
+know nothing of each other: they run on all cores, devices and processes there are, in any order, with the same results.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import PartitionSpec
+
+from jaxbeam._tree import Numbers, compiled, is_concrete, to_device, unlock
+from jaxbeam.equilibrium import differentiable_rows
+from jaxbeam.follow import follow
+from jaxbeam.held import check_held
+from jaxbeam.linear import Layout, expand, gather
+from jaxbeam.newton import Newton, topology
+from jaxbeam.predictor import STATES, Trail
+from jaxbeam.scene import Scene, command, energy, partway
+from jaxbeam.solution import Solution
+
+# Commands of a chunk, and the numbers that its states and tangents may take (half a gigabyte).
+CHUNK = 128
+MEMORY = 1 << 26
+
+
+def sweep(
+    scene: Scene,
+    ratios: Numbers,
+    solver: Newton = Newton(),
+    progress: Callable[[int, int], None] | None = None,
+) -> Solution:
+    """The equilibrium of each of many commands.
+
+    Each is continued from the nearest of those nearer to rest that are solved already, and solved from rest where that
+    fails. Where a command has several equilibria it is the one that a beam comes to whose tendons are pulled ever more;
+    `ramp` follows a way of your own. One that fails harms no other.
+
+    It runs on all cores of all local devices. Where `jax.distributed` is set up every process calls it with the same
+    arguments, solves a part, and gets the whole; the results do not depend on how many there are.
+
+    Args:
+        scene: with `m` tendons.
+        ratios: `(B, m)`, positive.
+        solver: settings of each solve.
+        progress: called with how many of this process's commands are solved and how many there are, whenever there are
+            more. Not called inside jit.
+
+    Returns:
+        A `Solution` with leading axis `B`, differentiable as that of `equilibrium` is, lane by lane.
+
+    Raises:
+        ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
+    """
+    shape = np.shape(ratios)
+    if len(shape) != 2 or shape[0] == 0:
+        raise ValueError(f"ratios: expected shape (B, m), a row for each command, got {shape}")
+    if is_concrete(ratios):
+        array = np.asarray(ratios, float)
+        bad = np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1))
+        if bad.size:
+            raise ValueError(f"ratios: expected positive finite numbers, got {array[bad[0]].tolist()} in row {bad[0]}")
+    check_held(scene)
+    jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
+    rows = to_device(ratios, scene.mesh.nodes.dtype)
+    layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
+    size = min(CHUNK, max(1, MEMORY // (scene.mesh.nodes.size * (1 + shape[1]))))
+    if is_concrete(rows, *jax.tree.leaves(scene)):
+        return _everywhere(open_scene, layout, np.asarray(rows), size, solver, progress)
+    batch = _in_one_program(*lax.stop_gradient((open_scene, layout, rows)), min(size, shape[0]), solver)
+    return differentiable_rows(open_scene, layout, rows, batch, solver)
+
+
+# ------------------------------------------------------------------------------------------------ one chunk
+
+
+class Chunk(NamedTuple):
+    """What is known in a chunk of `C` commands. The last of the `C + 1` places is the beam at rest."""
+
+    ratios: jax.Array  # (C + 1, m)
+    loaded: jax.Array  # (C + 1,) share of the dead loads: 0 at rest
+    x: jax.Array  # (C + 1, n, 2)
+    drift: jax.Array  # (C + 1, m, n, 2) derivative of x in each ratio
+    usable: jax.Array  # (C + 1,) may be continued from
+    known: jax.Array  # (C + 1,) its drift is known
+    parent: jax.Array  # (C + 1,) the place it was continued from,
+    joined: jax.Array  # (C + 1,) smoothly
+
+
+@compiled("solver")
+def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array, solver: Newton) -> Solution:
+    """The equilibria of the first `count` of the commands `rows` `(C, m)`, from rest outward."""
+    size, m = rows.shape
+    rest = scene.mesh.nodes
+    order = jnp.argsort(jnp.sum((rows - 1) ** 2, axis=1) + jnp.where(jnp.arange(size) < count, 0, jnp.inf))
+    no, places = jnp.zeros(size + 1, bool), jnp.zeros((size + 1, *rest.shape), rest.dtype)
+    chunk = Chunk(
+        ratios=jnp.concatenate([rows, jnp.ones((1, m), rows.dtype)]),
+        loaded=jnp.ones(size + 1, rest.dtype).at[-1].set(0),
+        x=places.at[-1].set(rest),
+        drift=jnp.zeros((size + 1, m, *rest.shape), rest.dtype),
+        usable=no.at[-1].set(True),
+        known=no,
+        parent=jnp.full(size + 1, size, jnp.int32),
+        joined=no,
+    )
+
+    # A command that fails is begun again at rest: `follow` is traced once for both.
+    def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
+        chunk, all = carry
+        lane = order[k]
+        near = jnp.sum((chunk.ratios - rows[lane]) ** 2, axis=1)
+        nearest = jnp.argmin(jnp.where(chunk.usable, near, jnp.inf)).astype(jnp.int32)
+
+        def attempt(carry: Any) -> Any:
+            parent, _, chunk, all = carry
+            chunk, found = _continue(scene, layout, chunk, lane, parent, solver)
+            all = jax.tree.map(lambda many, new: many.at[lane].set(new), all, found)
+            again = (found.status != 0) & (parent != size)
+            return jnp.asarray(size, jnp.int32), again, chunk, all
+
+        _, _, chunk, all = lax.while_loop(lambda c: c[1], attempt, (nearest, jnp.asarray(True), chunk, all))
+        return chunk, all
+
+    single = jax.eval_shape(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver)[1])
+    none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), single)
+    return lax.fori_loop(0, count, one, (chunk, none))[1]
+
+
+def _continue(
+    scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, parent: jax.Array, solver: Newton
+) -> tuple[Chunk, Solution]:
+    """The equilibrium of a lane, continued from that of its parent, and the chunk with it."""
+    ratios, here = chunk.ratios[lane], chunk.ratios[parent]
+    loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
+    scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * here + s * ratios)
+    trail = _trail(chunk, parent, ratios)
+    path, factor, after = follow(scene_at, layout, trail, jnp.ones(1, chunk.x.dtype), solver)
+    found = jax.tree.map(lambda leaf: leaf[0], path)
+    slope = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
+    pull = lambda e: gather(layout, jax.jvp(slope, (ratios,), (e,))[1])
+    pulls = jax.vmap(pull, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
+    moves = solver.linear.solve(layout, factor, pulls)
+    drift = jax.vmap(lambda v: expand(layout, -v, found.x.shape), in_axes=1)(moves)
+    good = found.status == 0
+    known = good & (after.count > 0) & jnp.all(jnp.isfinite(drift))
+    return Chunk(
+        ratios=chunk.ratios,
+        loaded=chunk.loaded,
+        x=chunk.x.at[lane].set(found.x),
+        drift=chunk.drift.at[lane].set(drift),
+        usable=chunk.usable.at[lane].set(good),
+        known=chunk.known.at[lane].set(known),
+        parent=chunk.parent.at[lane].set(parent),
+        joined=chunk.joined.at[lane].set((after.count > 1) & (found.attempts == 1)),
+    ), found
+
+
+def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
+    """The trail from the ancestors that lie on the line from the parent on to `ratios`: the parent at `s = 0`."""
+    direction = ratios - chunk.ratios[parent]
+    length = jnp.sum(direction**2)
+    places, s, fits = [parent], [jnp.zeros((), ratios.dtype)], [chunk.known[parent]]
+    for _ in range(STATES - 1):
+        last = places[-1]
+        place = chunk.parent[last]
+        back = chunk.ratios[place] - chunk.ratios[parent]
+        along = jnp.sum(back * direction) / jnp.where(length > 0, length, 1)
+        aside = jnp.sum((back - along * direction) ** 2)
+        # Farther back by more than a hair, or the polynomial through both is ill-defined.
+        behind = along < s[-1] - 0.01
+        fits.append(fits[-1] & chunk.joined[last] & chunk.known[place] & behind & (aside <= 1e-12 * length))
+        places.append(place)
+        s.append(along)
+    where = jnp.stack(places)
+    slopes = jnp.einsum("qmna,m->qna", chunk.drift[where], direction)
+    return Trail(jnp.stack(s), chunk.x[where], slopes, jnp.sum(jnp.stack(fits), dtype=jnp.int32))
+
+
+# ------------------------------------------------------------------------------------------------ many chunks
+
+
+@partial(jax.jit, static_argnames=("size", "solver"))
+def _in_one_program(scene: Scene, layout: Layout, rows: jax.Array, size: int, solver: Newton) -> Solution:
+    """The equilibria of traced commands `rows` `(B, m)`, in chunks of consecutive ones."""
+    count = len(rows)
+    chunks = -(-count // size)
+    padded = jnp.concatenate([rows, jnp.ones((chunks * size - count, rows.shape[1]), rows.dtype)])
+    counts = jnp.minimum(size, count - size * jnp.arange(chunks))
+    parts = lax.map(lambda part: solve_chunk(scene, layout, *part, solver), (padded.reshape(chunks, size, -1), counts))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], parts)
+
+
+@compiled("devices", "solver")
+def _on_devices(
+    scene: Scene,
+    layout: Layout,
+    rows: jax.Array,
+    counts: jax.Array,
+    devices: tuple[jax.Device, ...],
+    solver: Newton,
+) -> Solution:
+    """One chunk on each device: `rows` `(D, C, m)`, of which the first `counts` `(D,)` are solved."""
+    each = PartitionSpec("devices")
+    one = lambda scene, layout, rows, counts: jax.tree.map(
+        lambda leaf: leaf[None], solve_chunk(scene, layout, rows[0], counts[0], solver)
+    )
+    specs = (PartitionSpec(), PartitionSpec(), each, each)
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    return jax.shard_map(one, mesh=mesh, in_specs=specs, out_specs=each, check_vma=False)(scene, layout, rows, counts)
+
+
+def _everywhere(
+    scene: Scene,
+    layout: Layout,
+    rows: np.ndarray,
+    size: int,
+    solver: Newton,
+    progress: Callable[[int, int], None] | None,
+) -> Solution:
+    """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
+    parts = _partition(rows, np.arange(len(rows)), size)
+    processes, devices = jax.process_count(), tuple(jax.local_devices())
+    mine = parts[jax.process_index() :: processes]
+    jobs = [mine[k : k + len(devices)] for k in range(0, len(mine), len(devices))]
+
+    def solve(job: list[np.ndarray]) -> list[Solution]:
+        chunks, counts = np.ones((len(devices), size, rows.shape[1]), rows.dtype), np.zeros(len(devices), np.int32)
+        for k, part in enumerate(job):
+            chunks[k, : len(part)], counts[k] = rows[part], len(part)
+        found = jax.device_get(_on_devices(scene, layout, chunks, counts, devices, solver))
+        return [jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(job))]
+
+    results: list[Solution] = []
+    # Devices of a kind share the work by themselves; a processor's cores are one device, and each takes a job.
+    workers = (os.cpu_count() or 1) if len(devices) == 1 and devices[0].platform == "cpu" else 1
+    with ThreadPoolExecutor(workers) as pool:
+        # The first alone, for it compiles.
+        for run, some in ((map, jobs[:1]), (pool.map, jobs[1:])):
+            for found in run(solve, some):
+                results += found
+                if progress is not None:
+                    progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
+    everyone = results if processes == 1 else _gathered(results, len(parts))
+    return _assembled(parts, everyone)
+
+
+def _gathered(mine: list[Solution], count: int) -> list[Solution]:
+    """The solutions of all `count` parts, from those of this process and of the others."""
+    from jax.experimental import multihost_utils
+
+    processes = jax.process_count()
+    most = -(-count // processes)
+    # Every process must bring as many, and there are more parts than processes or the caller has none to show.
+    padded = mine + [mine[-1]] * (most - len(mine))
+    everyone = multihost_utils.process_allgather(jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
+    return [jax.tree.map(lambda leaf, k=k: leaf[k % processes, k // processes], everyone) for k in range(count)]
+
+
+def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
+    """The solutions of all parts, in the order in which the commands were given."""
+    order = np.argsort(np.concatenate(parts))
+    join = lambda *leaves: to_device(
+        np.concatenate([leaf[: len(part)] for leaf, part in zip(leaves, parts, strict=True)])[order]
+    )
+    return jax.tree.map(join, *results)
+
+
+def _partition(rows: np.ndarray, lanes: np.ndarray, size: int) -> list[np.ndarray]:
+    """Lanes in groups of at most `size`, near to each other: the widest coordinate is halved until they fit."""
+    if len(lanes) <= size:
+        return [lanes]
+    axis = np.argmax(np.ptp(rows[lanes], axis=0))
+    ordered = lanes[np.argsort(rows[lanes, axis], kind="stable")]
+    middle = -(-len(lanes) // (2 * size)) * size
+    return _partition(rows, ordered[:middle], size) + _partition(rows, ordered[middle:], size)
