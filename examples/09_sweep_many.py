@@ -54,7 +54,8 @@ def draw_reach(scene: jb.Scene, tips: np.ndarray, angles: np.ndarray, bad: np.nd
     for k in (int(np.argmin(angles)), int(np.argmax(angles))):
         ax.plot(*x[k][corners].transpose(2, 1, 0), color="0.82", linewidth=0.4, zorder=0)
     ax.plot(*np.asarray(scene.mesh.nodes)[corners].transpose(2, 1, 0), color="0.7", linewidth=0.4, zorder=0)
-    dots = ax.scatter(*tips[~bad].T, c=angles[~bad], s=3, cmap="RdBu_r", norm=TwoSlopeNorm(0, -38, 38), linewidths=0)
+    across, up = tips[~bad].T
+    dots = ax.scatter(across, up, c=angles[~bad], s=3, cmap="RdBu_r", norm=TwoSlopeNorm(0, -38, 38), linewidths=0)
     figure.colorbar(dots, label="tip angle (degrees)", ticks=np.arange(-30, 31, 10), shrink=0.8)
     ax.spines[["top", "right"]].set_visible(False)
     return figure

@@ -1,7 +1,7 @@
 """jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
 
-Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> measures -> design. Pictures are in
-`jaxbeam.plot`, which is imported by itself because it needs matplotlib.
+Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> sweep -> measures -> design.
+Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib.
 """
 
 from jaxbeam.actuation import commands as commands

@@ -126,7 +126,7 @@ def unlock(tree: T) -> T:
             # Once an owner: a scene is commanded and solved again and again.
             slot = "_device_" + field.name
             if slot not in tree.__dict__:
-                tree.__dict__[slot] = to_device(value)
+                object.__setattr__(tree, slot, to_device(value))
             value = tree.__dict__[slot]
         elif "kind" not in field.metadata:
             value = unlock(value)
@@ -177,12 +177,16 @@ def to_device(values: Any, dtype: Any = None) -> jax.Array:
 COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
+def _outside() -> bool:
+    """Whether this is run, not traced."""
+    return is_concrete(jax.device_put(0))
+
+
 def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Decorator: `jax.jit` with static arguments of these names, for the solver's own entry points.
 
-    With concrete arguments the function runs at once, also inside a user's jit, where it is a constant; that is the
-    only place where compiler options may be given. With traced ones it is an ordinary jitted function, but under `vmap`
-    it solves lane after lane: batched, all lanes would do what any of them needs.
+    Called outside any transformation it is compiled with our own options, which JAX takes nowhere else. Under `vmap` it
+    solves lane after lane: batched, all lanes would do what any of them needs.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -194,9 +198,8 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
         def call(*arguments: Any, **named: Any) -> T:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
-            if is_concrete(*jax.tree.leaves(values)):
-                with jax.ensure_compile_time_eval():
-                    return outermost(**values, **settings)
+            if is_concrete(*jax.tree.leaves(values)) and _outside():
+                return outermost(**values, **settings)
             in_turn = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))
             return in_turn(values)
 

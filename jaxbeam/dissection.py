@@ -27,14 +27,17 @@ from jax import lax
 
 from jaxbeam._tree import pytree, static_field, to_device
 from jaxbeam.linear import BlockTridiagonal, Topology, _blocks
-from jaxbeam.ordering import SIZES, Couplings, Fronts, couplings, fronts, running
+from jaxbeam.ordering import TILE, Couplings, Fronts, couplings, fronts, running
 
 # Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See `automatic`.
-CROSSOVER = 2e8
+CROSSOVER = 1.2e9
 # Triangular tiles up to this size are inverted by LAPACK, larger ones by halves.
-SMALL = 32
+SMALL = 16
 # Place of what a front below has not: past the end of the room for `S`, which is read as its last number, a zero.
 NONE = 2**29
+AREA = TILE * TILE
+# XLA 0.10 subtracts arrays of this many columns in a quarter of the time that square tiles take.
+LANES = 8
 # Columns of `DissectionLayout.front`.
 PIVOTS, TILES, FACTOR, UPDATE, ROWS, FIRST, LAST = range(7)
 
@@ -46,9 +49,9 @@ class DissectionLayout:
     place `(size,)`: where in the factor each stored entry goes.
     front `(fronts, 7)`: tiles of pivots and of all; where its factor, `S` and `rows` begin; range of `edge`.
     rows: unknown of each row of each front; `N` in the padding.
-    edge `(fronts,)`: of each front below, grouped by the front above it, where its part of `row` begins.
+    edge: of each front that has one above, grouped by the front above it, where its part of `row` begins.
     row, column: for each row of the front above, what to add to find it as row or as column of `S` below.
-    ends: number of fronts up to each tile size, sizes of the factor and of the room for `S`.
+    sizes: of the factor, of the room for `S` and of a row of tiles of pivots.
     """
 
     slots: jax.Array
@@ -62,7 +65,6 @@ class DissectionLayout:
     edge: jax.Array
     row: jax.Array
     column: jax.Array
-    ends: jax.Array
     sizes: tuple[int, int, int] = static_field()
 
 
@@ -78,12 +80,14 @@ class NestedDissection:
     """Multifrontal Cholesky over a nested dissection of the mesh: for meshes of many thousand unknowns.
 
     leaf: about how many unknowns a part has that is not split further.
+    join: join small parts again where that is expected to save time.
     """
 
-    leaf: int = 64
+    leaf: int = 48
+    join: bool = True
 
     def layout(self, topology: Topology) -> DissectionLayout:
-        return _layout(topology, self.leaf)
+        return _layout(topology, self.leaf, self.join)
 
     def factor(self, layout: DissectionLayout, storage: jax.Array) -> tuple[Factor, jax.Array]:
         factor, bad = _factor(layout, storage, True)
@@ -103,8 +107,8 @@ class NestedDissection:
 # ------------------------------------------------------------------------------------------- numbers
 
 
-def _tile(pool: jax.Array, at: jax.Array, size: int) -> jax.Array:
-    return lax.dynamic_slice_in_dim(pool, at, size * size).reshape(size, size)
+def _tile(pool: jax.Array, at: jax.Array) -> jax.Array:
+    return lax.dynamic_slice_in_dim(pool, at, AREA).reshape(TILE, TILE)
 
 
 def _put(pool: jax.Array, tile: jax.Array, at: jax.Array) -> jax.Array:
@@ -150,47 +154,46 @@ def _factor(layout: DissectionLayout, storage: jax.Array, definite: bool) -> tup
     sign = None if definite else jnp.ones(layout.slots.size, storage.dtype)
     work = jnp.zeros(layout.sizes[2], storage.dtype)
     carry = (tiles, updates, work, sign, jnp.int32(0))
-    for k, size in enumerate(SIZES):
-        carry = _loop(layout.ends[k], layout.ends[k + 1], partial(_eliminate, layout, size, definite), carry)
-    tiles, _, _, sign, count = carry
+    tiles, _, _, sign, count = _loop(0, len(layout.front), partial(_eliminate, layout, definite), carry)
     return Factor(tiles, sign), count
 
 
-def _eliminate(layout: DissectionLayout, size: int, definite: bool, f: jax.Array, carry: Any) -> Any:
-    """Eliminate the pivots of a front of tiles of one size."""
+def _eliminate(layout: DissectionLayout, definite: bool, f: jax.Array, carry: Any) -> Any:
+    """Eliminate the pivots of a front."""
     info = layout.front[f]
-    pivots, total, area = info[PIVOTS], info[TILES], size * size
-    place = lambda i, j: info[FACTOR] + area * _at(i, j, total)
+    pivots, total = info[PIVOTS], info[TILES]
+    place = lambda i, j: info[FACTOR] + AREA * _at(i, j, total)
 
     def right(j: jax.Array, columns: jax.Array, carry: Any) -> Any:
         """Transpose row `j` of tiles once for all products with it."""
         tiles, updates, work, sign, count = carry
 
         def put(q: jax.Array, work: jax.Array) -> jax.Array:
-            tile = _tile(tiles, place(j, q), size).T
+            tile = _tile(tiles, place(j, q)).T
             if not definite:
-                tile = tile * lax.dynamic_slice_in_dim(sign, layout.rows[info[ROWS] + q * size], size)[:, None]
-            return _put(work, tile, area * q)
+                tile = tile * lax.dynamic_slice_in_dim(sign, layout.rows[info[ROWS] + q * TILE], TILE)[:, None]
+            return _put(work, tile, AREA * q)
 
         return tiles, updates, _loop(0, columns, put, work), sign, count
 
     def reduced(a: jax.Array, i: jax.Array, j: jax.Array, columns: jax.Array, carry: Any) -> jax.Array:
         """Tile `a` with what the fronts below pass on, less the products of the columns before it."""
         tiles, updates, work, _, _ = carry
-        a = _loop(info[FIRST], info[LAST], lambda e, a: a + _extend(layout, updates, e, i, j, size), a)
-        return _loop(0, columns, lambda q, a: a - _tile(tiles, place(i, q), size) @ _tile(work, area * q, size), a)
+        a = _loop(info[FIRST], info[LAST], lambda e, a: a + _extend(layout, updates, e, i, j), a)
+        product = lambda q: (_tile(tiles, place(i, q)) @ _tile(work, AREA * q)).reshape(-1, LANES)
+        return _loop(0, columns, lambda q, a: a - product(q), a.reshape(-1, LANES)).reshape(TILE, TILE)
 
     def pivot(j: jax.Array, carry: Any) -> Any:
         tiles, updates, work, sign, count = carry = right(j, j, carry)
-        a = reduced(_tile(tiles, place(j, j), size), j, j, j, carry)
+        a = reduced(_tile(tiles, place(j, j)), j, j, j, carry)
         w, d, bad = (_cholesky_pivot if definite else _any_pivot)(a)
-        tiles, work = _put(tiles, w, place(j, j)), _put(work, w.T, area * j)
+        tiles, work = _put(tiles, w, place(j, j)), _put(work, w.T, AREA * j)
         if not definite:
-            sign = lax.dynamic_update_slice_in_dim(sign, d, layout.rows[info[ROWS] + j * size], 0)
+            sign = lax.dynamic_update_slice_in_dim(sign, d, layout.rows[info[ROWS] + j * TILE], 0)
 
         def below(i: jax.Array, carry: Any) -> Any:
-            a = reduced(_tile(carry[0], place(i, j), size), i, j, j, carry)
-            return (_put(carry[0], a @ _tile(carry[2], area * j, size), place(i, j)), *carry[1:])
+            a = reduced(_tile(carry[0], place(i, j)), i, j, j, carry)
+            return (_put(carry[0], a @ _tile(carry[2], AREA * j), place(i, j)), *carry[1:])
 
         return _loop(j + 1, total, below, (tiles, updates, work, sign, count + bad))
 
@@ -198,8 +201,8 @@ def _eliminate(layout: DissectionLayout, size: int, definite: bool, f: jax.Array
         carry = right(j, pivots, carry)
 
         def row(i: jax.Array, carry: Any) -> Any:
-            a = reduced(jnp.zeros((size, size), carry[0].dtype), i, j, pivots, carry)
-            at = info[UPDATE] + area * _at(i - pivots, j - pivots, total - pivots)
+            a = reduced(jnp.zeros((TILE, TILE), carry[0].dtype), i, j, pivots, carry)
+            at = info[UPDATE] + AREA * _at(i - pivots, j - pivots, total - pivots)
             return (carry[0], _put(carry[1], a, at), *carry[2:])
 
         return _loop(j, total, row, carry)
@@ -207,40 +210,36 @@ def _eliminate(layout: DissectionLayout, size: int, definite: bool, f: jax.Array
     return _loop(pivots, total, rest, _loop(0, pivots, pivot, carry))
 
 
-def _extend(
-    layout: DissectionLayout, updates: jax.Array, e: jax.Array, i: jax.Array, j: jax.Array, size: int
-) -> jax.Array:
+def _extend(layout: DissectionLayout, updates: jax.Array, e: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
     """What a front below adds to tile `(i, j)`."""
-    row = lax.dynamic_slice_in_dim(layout.row, layout.edge[e] + i * size, size)
-    column = lax.dynamic_slice_in_dim(layout.column, layout.edge[e] + j * size, size)
+    row = lax.dynamic_slice_in_dim(layout.row, layout.edge[e] + i * TILE, TILE)
+    column = lax.dynamic_slice_in_dim(layout.column, layout.edge[e] + j * TILE, TILE)
     return updates.at[row[:, None] + column].get(mode="promise_in_bounds")
 
 
 def _solve(layout: DissectionLayout, factor: Factor, rhs: jax.Array) -> jax.Array:
     x = jnp.pad(rhs.reshape(len(rhs), -1), ((0, 1), (0, 0)))
-    for k, size in enumerate(SIZES):
-        x = _loop(layout.ends[k], layout.ends[k + 1], partial(_forward, layout, factor, size), x)
-    for k, size in reversed(list(enumerate(SIZES))):
-        last = layout.ends[k + 1] - 1
-        x = _loop(0, last + 1 - layout.ends[k], lambda t, x: _backward(layout, factor, size, last - t, x), x)
+    count = len(layout.front)
+    x = _loop(0, count, partial(_forward, layout, factor), x)
+    x = _loop(0, count, lambda t, x: _backward(layout, factor, count - 1 - t, x), x)
     return x[:-1].reshape(rhs.shape)
 
 
-def _parts(layout: DissectionLayout, factor: Factor, size: int, f: jax.Array) -> Any:
+def _parts(layout: DissectionLayout, factor: Factor, f: jax.Array) -> Any:
     """Numbers of tiles of a front, and functions for its tile `(i, j)`, its rows and the pivots' signs."""
     info = layout.front[f]
-    tile = lambda i, j: _tile(factor.tiles, info[FACTOR] + size * size * _at(i, j, info[TILES]), size)
-    rows = lambda i: lax.dynamic_slice_in_dim(layout.rows, info[ROWS] + i * size, size)
+    tile = lambda i, j: _tile(factor.tiles, info[FACTOR] + AREA * _at(i, j, info[TILES]))
+    rows = lambda i: lax.dynamic_slice_in_dim(layout.rows, info[ROWS] + i * TILE, TILE)
     signed = lambda j, y: y if factor.sign is None else y * factor.sign[rows(j)][:, None]
     return info[PIVOTS], info[TILES], tile, rows, signed
 
 
-def _forward(layout: DissectionLayout, factor: Factor, size: int, f: jax.Array, x: jax.Array) -> jax.Array:
-    pivots, total, tile, rows, signed = _parts(layout, factor, size, f)
-    own = lambda j, x: lax.dynamic_slice_in_dim(x, rows(j)[0], size)
+def _forward(layout: DissectionLayout, factor: Factor, f: jax.Array, x: jax.Array) -> jax.Array:
+    pivots, total, tile, rows, signed = _parts(layout, factor, f)
+    own = lambda j, x: lax.dynamic_slice_in_dim(x, rows(j)[0], TILE)
 
     def known(i: jax.Array, last: jax.Array, x: jax.Array) -> jax.Array:
-        start = jnp.zeros((size, x.shape[1]), x.dtype)
+        start = jnp.zeros((TILE, x.shape[1]), x.dtype)
         return _loop(0, last, lambda j, y: y + tile(i, j) @ signed(j, own(j, x)), start)
 
     def pivot(j: jax.Array, x: jax.Array) -> jax.Array:
@@ -253,14 +252,14 @@ def _forward(layout: DissectionLayout, factor: Factor, size: int, f: jax.Array, 
     return _loop(pivots, total, row, _loop(0, pivots, pivot, x))
 
 
-def _backward(layout: DissectionLayout, factor: Factor, size: int, f: jax.Array, x: jax.Array) -> jax.Array:
-    pivots, total, tile, rows, signed = _parts(layout, factor, size, f)
+def _backward(layout: DissectionLayout, factor: Factor, f: jax.Array, x: jax.Array) -> jax.Array:
+    pivots, total, tile, rows, signed = _parts(layout, factor, f)
 
     def pivot(t: jax.Array, x: jax.Array) -> jax.Array:
         j = pivots - 1 - t
         known = lambda i, y: y + tile(i, j).T @ x.at[rows(i)].get(mode="promise_in_bounds")
-        later = _loop(j + 1, total, known, jnp.zeros((size, x.shape[1]), x.dtype))
-        own = lax.dynamic_slice_in_dim(x, rows(j)[0], size)
+        later = _loop(j + 1, total, known, jnp.zeros((TILE, x.shape[1]), x.dtype))
+        own = lax.dynamic_slice_in_dim(x, rows(j)[0], TILE)
         return lax.dynamic_update_slice_in_dim(x, tile(j, j).T @ signed(j, own - later), rows(j)[0], 0)
 
     return _loop(0, pivots, pivot, x)
@@ -270,11 +269,10 @@ def _backward(layout: DissectionLayout, factor: Factor, size: int, f: jax.Array,
 
 
 class _Plan(NamedTuple):
-    """Of each front: size of its tiles, how many hold pivots and further unknowns, and where its factor, `S`, rows and
-    first unknown are. Of each node: its first row in its front. Of each head: its first row in `S`. Then the sizes of
+    """Of each front: how many tiles hold pivots and further unknowns, and where its factor, `S`, rows and first
+    unknown are. Of each node: its first row in its front. Of each head: its first row in `S`. Then the sizes of
     the factor, of the room for `S`, of all rows, and the number of unknowns."""
 
-    width: np.ndarray
     pivots: np.ndarray
     rest: np.ndarray
     factor: np.ndarray
@@ -287,11 +285,11 @@ class _Plan(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _layout(topology: Topology, leaf: int) -> DissectionLayout:
+def _layout(topology: Topology, leaf: int, join: bool) -> DissectionLayout:
     fixed = topology.fixed.array
     n, d = fixed.shape
     pairs = couplings(topology)
-    tree = fronts(topology, leaf, pairs)
+    tree = fronts(topology, leaf, join, pairs)
     plan = _plan(tree, (~fixed).sum(axis=1))
     size = plan.totals[3]
     coordinate = np.cumsum(~fixed, axis=1) - 1  # of a node's free coordinates
@@ -329,44 +327,34 @@ def _plan(tree: Fronts, dofs: np.ndarray) -> _Plan:
     inside = running(tree.head_front, dofs[tree.head_node])
     s = np.bincount(tree.front[free], dofs[free], minlength=count).astype(int)
     u = np.bincount(tree.head_front, dofs[tree.head_node], minlength=count).astype(int)
-    width = np.array(SIZES)[tree.size]
-    p, q = -(-s // width), -(-u // width)
-    begins = [np.cumsum(np.append(0, a)) for a in (_at(p, p, p + q) * width**2, (p + q) * width, p * width)]
-    factor, rows, unknown = begins
-    most = max(SIZES) ** 2
-    update, room = _stacks(tree, _at(q, q, q) * width**2)
+    p, q = -(-s // TILE), -(-u // TILE)
+    factor, rows, unknown = (np.cumsum(np.append(0, a)) for a in (_at(p, p, p + q) * AREA, (p + q) * TILE, p * TILE))
+    update, room = _stacks(tree, _at(q, q, q) * AREA)
     # At least one tile, so that slices of it fit.
-    totals = (max(int(factor[-1]), most), room + most, int(rows[-1]), int(unknown[-1]))
-    return _Plan(width, p, q, factor[:-1], update, rows[:-1], unknown[:-1], within, inside, totals)
+    totals = (max(int(factor[-1]), AREA), room + AREA, int(rows[-1]), int(unknown[-1]))
+    return _Plan(p, q, factor[:-1], update, rows[:-1], unknown[:-1], within, inside, totals)
 
 
 def _stacks(tree: Fronts, amount: np.ndarray) -> tuple[np.ndarray, int]:
     """Where `S` of each front begins, and how much room all need.
 
     Fronts come in postorder, so two stacks do, for even and odd levels of the tree: `S` is put on one while those of
-    the fronts below are on top of the other. What goes to a front of larger tiles is kept aside.
+    the fronts below are on top of the other.
     """
     count = amount.size
-    level, first = np.zeros(count, int), np.full(count, count)
+    level, first = [0] * count, [-1] * count  # and the first front below
     for f in range(count - 1, -1, -1):
         if tree.parent[f] >= 0:
             level[f], first[tree.parent[f]] = level[tree.parent[f]] + 1, f
-    aside = (tree.parent >= 0) & (tree.size[tree.parent] > tree.size)
-    stack, at = np.where(aside, 2, level % 2), np.zeros(count, int)
-    # The first front below that is on the stack.
-    first = np.full(count, -1)
-    for f in range(count - 1, -1, -1):
-        if tree.parent[f] >= 0 and not aside[f]:
-            first[tree.parent[f]] = f
-    top, most = [0, 0, 0], [0, 0, 0]
+    at, top, most = np.zeros(count, int), [0, 0], [0, 0]
     for f in range(count):
-        k = int(stack[f])
+        k = level[f] % 2
         at[f] = top[k]
         top[k] += int(amount[f])
         most[k] = max(most[k], top[k])
         if first[f] >= 0:
-            top[1 - level[f] % 2] = int(at[first[f]])
-    return at + np.cumsum([0, *most])[stack], sum(most)
+            top[1 - k] = int(at[first[f]])
+    return at + np.array([0, most[0]])[np.array(level) % 2], sum(most)
 
 
 def _places(
@@ -393,16 +381,15 @@ def _places(
 
 
 def _address(plan: _Plan, f: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    w = plan.width[f]
-    tile = _at(row // w, column // w, (plan.pivots + plan.rest)[f])
-    return plan.factor[f] + tile * w**2 + row % w * w + column % w
+    tile = _at(row // TILE, column // TILE, (plan.pivots + plan.rest)[f])
+    return plan.factor[f] + tile * AREA + row % TILE * TILE + column % TILE
 
 
 def _head_rows(plan: _Plan, tree: Fronts, front: np.ndarray, node: np.ndarray) -> np.ndarray:
     """First row in a front of one of its further nodes."""
     n = tree.rank.size
     at = np.searchsorted(tree.head_front * n + tree.rank[tree.head_node], front * n + tree.rank[node])
-    return (plan.pivots * plan.width)[front] + plan.inside[at]
+    return plan.pivots[front] * TILE + plan.inside[at]
 
 
 class _Rows(NamedTuple):
@@ -417,15 +404,15 @@ class _Rows(NamedTuple):
 
 def _rows(plan: _Plan, tree: Fronts, unknown: np.ndarray) -> _Rows:
     """Unknown of each row of the fronts, and how rows of `S` correspond to those of the front above."""
-    size, w = plan.totals[3], plan.width
-    total, n = plan.pivots + plan.rest, tree.rank.size
+    size = plan.totals[3]
+    total = plan.pivots + plan.rest
     rows = np.full(plan.totals[2], size)
-    own = np.repeat(plan.rows - plan.unknown, plan.pivots * w) + np.arange(size)
+    own = np.repeat(plan.rows - plan.unknown, plan.pivots * TILE) + np.arange(size)
     rows[own] = np.arange(size)
     below = np.flatnonzero(tree.parent >= 0)
     below = below[np.argsort(tree.parent[below], kind="stable")]
     above = tree.parent[below]
-    at = np.cumsum(np.append(0, (total * w)[above]))
+    at = np.cumsum(np.append(0, total[above] * TILE))
     edge_of = np.zeros(total.size, int)
     edge_of[below] = np.arange(below.size)
 
@@ -434,18 +421,19 @@ def _rows(plan: _Plan, tree: Fronts, unknown: np.ndarray) -> _Rows:
     up = plan.within[node]
     far = tree.front[node] != p
     up[far] = _head_rows(plan, tree, p[far], node[far])
-    row, column = np.full(at[-1], NONE), np.full(at[-1], NONE)
+    # At least one tile, so that slices of it fit.
+    row, column = (np.full(max(int(at[-1]), TILE), NONE) for _ in range(2))
     number = np.zeros(f.size, int)
     for c in range(unknown.shape[1]):
         k = np.flatnonzero(unknown[node, c] < size)
         inner = plan.inside[k] + number[k]
-        rows[plan.rows[f[k]] + (plan.pivots * w)[f[k]] + inner] = unknown[node[k], c]
-        e, to, v, j = edge_of[f[k]], up[k] + number[k], w[f[k]], inner // w[f[k]]
-        row[at[e] + to] = inner * v
-        column[at[e] + to] = plan.update[f[k]] + _at(0, j, plan.rest[f[k]]) * v**2 + inner % v
+        rows[plan.rows[f[k]] + (plan.pivots * TILE)[f[k]] + inner] = unknown[node[k], c]
+        to = at[edge_of[f[k]]] + up[k] + number[k]
+        row[to] = inner * TILE
+        column[to] = plan.update[f[k]] + _at(0, inner // TILE, plan.rest[f[k]]) * AREA + inner % TILE
         number[k] += 1
     ranges = np.searchsorted(above, np.stack([np.arange(total.size), np.arange(total.size) + 1], axis=1))
-    return _Rows(rows, at[:-1], ranges, row, column)
+    return _Rows(rows, at, ranges, row, column)
 
 
 def _device_layout(
@@ -462,7 +450,6 @@ def _device_layout(
     if max(plan.totals[0] // 4, plan.totals[1]) >= NONE:
         raise ValueError(f"mesh: its factor would hold {plan.totals[0]} numbers, too many; use a coarser mesh")
     front = np.stack([plan.pivots, plan.pivots + plan.rest, plan.factor, plan.update, plan.rows], axis=1)
-    ends = np.searchsorted(tree.size, np.arange(len(SIZES) + 1))
     signed = lambda a: to_device(a.astype(np.int32))
     # Unsigned, so that JAX does not look for negative ones.
     unsigned = lambda a: to_device(a.astype(np.uint32))
@@ -480,8 +467,7 @@ def _device_layout(
             signed(rows.edge),
             unsigned(rows.row),
             unsigned(rows.column),
-            signed(ends),
-            (*plan.totals[:2], int((plan.pivots * plan.width**2).max(initial=1))),
+            (*plan.totals[:2], max(int(plan.pivots.max()), 1) * AREA),
         )
 
 
@@ -491,12 +477,12 @@ def automatic(topology: Topology) -> BlockTridiagonal | NestedDissection:
     Factor and solve on one busy core, in milliseconds of processor time:
 
         beam         unknowns   work     BlockTridiagonal   NestedDissection
-        57 x 13      1,456      2e6      1.9                9.2
-        113 x 25     5,600      3e7      11.8               19
-        225 x 49     21,952     5e8      120                98
+        57 x 13      1,456      2e6      2.0                4.4
+        113 x 25     5,600      3e7      11.6               17
+        225 x 49     21,952     5e8      96                 64
 
-    Compilation takes about 2 s for the first and 20 s or more for the second, so that few solves do not repay it near
-    the crossover.
+    Compilation takes about 1.5 s for the first and 3.5 s for the second, and the layout of the largest 0.1 and 0.7 s.
+    At the crossover, about 35,000 unknowns of a beam, 20 steps repay that.
     """
     fixed = topology.fixed.array
     width = np.bincount(_blocks(topology), (~fixed).sum(axis=1)).max()

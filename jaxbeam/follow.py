@@ -73,10 +73,12 @@ def follow(
     targets: jax.Array,
     solver: Newton,
     x: jax.Array | None = None,
+    way: jax.Array | None = None,
 ) -> tuple[Solution, Any, Trail]:
     """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
 
-    The first attempt goes from `x`, by default from where `trail` leads, straight to the first target. One that fails
+    The first attempt goes straight to the first target: from `x`, or else from the end of `trail` and `way` ahead of
+    it, by default along its tangent. One that fails
     is made in smaller steps, from the last good state (at first: the newest of `trail`, at `s = 0`), along the branch
     as it was so far; steps grow again while they succeed. When they have become too small the walk ends: what remains
     is reported `NOT_CONVERGED`, at the last good state. Returned with them are the factor of the stiffness at
@@ -98,7 +100,7 @@ def follow(
         trail=trail,
         trial=targets[0],
         start=rest if x is None else x,
-        way=jnp.where((trail.count > 0) & (x is None), targets[0] * trail.slope[0], 0),
+        way=jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0) if way is None else way,
         factor=no_factor(layout, rest.dtype, solver),
         increment=targets[0],
         cuts=count,
@@ -115,7 +117,7 @@ def follow(
         budget = jnp.minimum(ATTEMPT_STEPS * (1 + walk.cuts), solver.max_steps - walk.spent[0])
         slope_at = lambda s, x: jax.grad(energy, argnums=1)(scene_at(s), x)
         probes = lambda x: jnp.stack([jax.jvp(lambda s: slope_at(s, x), (walk.trial,), (zero + 1,))[1], noise])
-        free = jnp.where(trail.count > 0, FREE_STEPS, 0)
+        free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
         state = newton(scene, layout, walk.start, walk.way, jnp.where(walk.over, 0, budget), free, probes, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
         steps, attempts, status = counts[0], counts[3], counts[-1]

@@ -35,8 +35,14 @@ def project_semidefinite(hessians: jax.Array) -> jax.Array:
     Args:
         hessians: symmetric `(m, s, s)`.
     """
-    values, vectors = jnp.linalg.eigh(hessians)
-    return jnp.einsum("mik,mk,mjk->mij", vectors, jnp.maximum(values, 0), vectors)
+
+    def one(hessian: jax.Array) -> jax.Array:
+        values, vectors = jnp.linalg.eigh(hessian)
+        return (vectors * jnp.maximum(values, 0)) @ vectors.T
+
+    # One by one. A batched eigh shares XLA's threads out among its matrices and waits for them: two programs that run
+    # side by side, as in a sweep, then wait for each other for ever (jaxlib 0.10 on a processor of two cores).
+    return lax.map(one, hessians)
 
 
 @pytree
@@ -61,7 +67,9 @@ class Layout:
 
 
 class LinearSolver(Protocol):
-    """What `Newton` asks of a linear solver. It must be hashable."""
+    """What `Newton` asks of a linear solver."""
+
+    def __hash__(self) -> int: ...
 
     def layout(self, topology: Topology) -> Layout: ...
 

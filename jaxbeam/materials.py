@@ -39,9 +39,8 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
     _check_range("young", young, 0.0, np.inf, "a stiffness is positive")
     _check_range("poisson", poisson, -1.0, 0.5, "0.5 is incompressible, where lam is infinite: use 0.4999, say")
     xp, dtype = namespace(young, poisson), jnp.result_type(float)
-    young, poisson = xp.asarray(young, dtype), xp.asarray(poisson, dtype)
-    mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-    return Lame(to_device(mu), to_device(lam))
+    E, nu = xp.asarray(young, dtype), xp.asarray(poisson, dtype)
+    return Lame(to_device(E / (2 * (1 + nu))), to_device(E * nu / ((1 + nu) * (1 - 2 * nu))))
 
 
 def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:

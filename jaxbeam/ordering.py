@@ -14,44 +14,43 @@ import numpy as np
 
 from jaxbeam.linear import Topology
 
-# Sizes of tiles. For each, microseconds to subtract a product, to invert a pivot, and to add what a front below passes
-# on (one core of a Xeon of 2023).
-SIZES = (32, 96)
-PRODUCT, PIVOT, EXTEND = (4.5, 55.0), (13.0, 110.0), (1.5, 12.0)
-# What each front costs besides.
-FRONT = 4.0
+# Rows of a tile. Microseconds to subtract a product of tiles, to invert a tile, to add to one what a front below passes
+# on, and that a front costs besides (one core of a Xeon of 2023). A second, larger size for large fronts gains a tenth
+# at 200,000 unknowns, but compiles for twice as long.
+TILE = 32
+PRODUCT, PIVOT, EXTEND, FRONT = 4.5, 13.0, 1.5, 4.0
 # Directions of the cuts tried, from the longest axis of a region, and shares of its nodes on one side.
 ANGLES = np.linspace(-0.8, 0.8, 9)
 SHARES = (0.5, 0.46, 0.54)
 
 
 class Fronts(NamedTuple):
-    """Fronts in order of elimination, those of smaller tiles first.
+    """Fronts in order of elimination: each after all below it, those of a part of the tree together.
 
     front, rank `(n,)`: front and place in the order of elimination of each node; -1 and `n` if it is fixed.
     parent: front above each front; -1 if none.
-    size: number of its `SIZES`.
     head_front, head_node: the further nodes of all fronts, sorted by front and rank.
     """
 
     front: np.ndarray
     rank: np.ndarray
     parent: np.ndarray
-    size: np.ndarray
     head_front: np.ndarray
     head_node: np.ndarray
 
 
 class Couplings(NamedTuple):
-    """Pairs of nodes `first <= later` that couple, each node with itself too, and for each term the pairs `(m, k, k)` of
-    its stencils."""
+    """Pairs of nodes `first <= later` that couple, each node with itself too.
+
+    uses: for each term, the pairs `(m, k, k)` of its stencils.
+    """
 
     first: np.ndarray
     later: np.ndarray
     uses: list[np.ndarray]
 
 
-def fronts(topology: Topology, leaf: int, pairs: Couplings) -> Fronts:
+def fronts(topology: Topology, leaf: int, join: bool, pairs: Couplings) -> Fronts:
     """Fronts of all nodes that are not fixed."""
     fixed = topology.fixed.array
     n = len(fixed)
@@ -64,11 +63,10 @@ def fronts(topology: Topology, leaf: int, pairs: Couplings) -> Fronts:
     count = 2 ** (depth + 1) - 1
     s = np.bincount(heap[free], dofs[free], minlength=count).astype(int)
     u = np.bincount(head_heap, dofs[head_node], minlength=count).astype(int)
-    into, parent, size = _join(s, u)
-    # Children before parents, small tiles before large ones.
+    into, parent = _join(s, u, join)
     tier = np.floor(np.log2(np.arange(count) + 1.5)).astype(int)
     end = (np.arange(count) + 2 - 2**tier) << (depth - tier)
-    order = np.lexsort((-tier, end, size))
+    order = np.lexsort((-tier, end))
     order = order[into[order] == order]
     number = np.full(count + 1, -1)
     number[order] = np.arange(order.size)
@@ -77,7 +75,7 @@ def fronts(topology: Topology, leaf: int, pairs: Couplings) -> Fronts:
     kept = into[head_heap] == head_heap
     head_front, head_node = number[head_heap[kept]], head_node[kept]
     sort = np.lexsort((rank[head_node], head_front))
-    return Fronts(front, rank, number[parent[order]], size[order], head_front[sort], head_node[sort])
+    return Fronts(front, rank, number[parent[order]], head_front[sort], head_node[sort])
 
 
 def running(group: np.ndarray, amount: np.ndarray) -> np.ndarray:
@@ -131,47 +129,43 @@ def _heads(
     return np.concatenate([f for f, _ in reversed(parts)]), np.concatenate([v for _, v in reversed(parts)])
 
 
-def _join(s: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Join fronts with the one above while that saves time.
+def _join(s: np.ndarray, u: np.ndarray, save: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Join fronts of `s` pivots and `u` further unknowns with the one above while that saves time.
 
-    Returns the front each becomes part of, the front above it, and the number of its tiles' size.
+    Without `save`, only empty ones are joined. Returns the front that each becomes part of, and the front above it, -1
+    if none.
     """
     count = s.size
-    s, into, above = s.copy(), np.arange(count), np.full(count, -1)
+    pivots, rest = s.tolist(), u.tolist()
+    into, above = np.arange(count), np.full(count, -1)
     below: list[list[int]] = [[] for _ in range(count)]
-    cost, size = (np.array(a) for a in zip(*(_cost(int(a), int(b)) for a, b in zip(s, u, strict=True)), strict=True))
     for f in range(count - 1, -1, -1):
         below[f] = [c for c in (2 * f + 1, 2 * f + 2) if c < count]
-        waiting = sorted(below[f], key=lambda c: int(u[c]))
+        waiting = sorted(below[f], key=lambda c: rest[c])
         while waiting:
             c = waiting.pop(0)
-            joined, tiles = _cost(int(s[f] + s[c]), int(u[f]))
-            if s[c] and joined > cost[f] + cost[c]:
+            apart = _cost(pivots[f], rest[f]) + _cost(pivots[c], rest[c])
+            if pivots[c] and not (save and _cost(pivots[f] + pivots[c], rest[f]) <= apart):
                 continue
-            s[f], cost[f], size[f] = s[f] + s[c], joined, tiles
+            pivots[f] += pivots[c]
             into[c] = f
             below[f] = [b for b in below[f] if b != c] + below[c]
             waiting += below[c]
-        for c in below[f]:
-            size[f] = max(size[f], size[c])
     for f in range(count):
-        if into[f] != f:
+        if into[f] == f:
+            above[below[f]] = f
+        else:
             into[f] = into[into[f]]
-        for c in below[f] if into[f] == f else ():
-            above[c] = f
-    return into, above, size
+    return into, above
 
 
 @cache
-def _cost(s: int, u: int) -> tuple[float, int]:
-    """Time to eliminate a front, and the number of the size of tiles that takes least."""
-    times = []
-    for size, product, pivot, extend in zip(SIZES, PRODUCT, PIVOT, EXTEND, strict=True):
-        p, q = -(-s // size), -(-u // size)
-        # A product for each tile below a pivot, for each column before one, and for each pivot and tile of the rest.
-        products = p * (p - 1) // 2 + p * q + (p - 1) * p * (p + 1) // 6 + q * p * (p - 1) // 2 + p * q * (q + 1) // 2
-        times.append(FRONT + product * products + pivot * p + extend * (q + 1) ** 2)
-    return min(times), int(np.argmin(times))
+def _cost(s: int, u: int) -> float:
+    """Time to eliminate a front."""
+    p, q = -(-s // TILE), -(-u // TILE)
+    # A product for each tile below a pivot, for each column before one, and for each pivot and tile of the rest.
+    products = p * (p - 1) // 2 + p * q + (p - 1) * p * (p + 1) // 6 + q * p * (p - 1) // 2 + p * q * (q + 1) // 2
+    return FRONT + PRODUCT * products + PIVOT * p + EXTEND * (q + 1) ** 2
 
 
 def _dissect(topology: Topology, leaf: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -233,6 +227,7 @@ def _distances(root: int, start: np.ndarray, neighbour: np.ndarray) -> np.ndarra
 def _bisect(places: np.ndarray, i: np.ndarray, j: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
     """Level and index of the front of each node; all regions of one level of the tree are split at a time."""
     n = len(places)
+    i, j = i[i < j], j[i < j]
     level, region, index = np.full(n, depth), np.zeros(n, int), np.zeros(n, int)
     for tier in range(depth):
         active = np.flatnonzero(level == depth)
@@ -253,7 +248,8 @@ def _bisect(places: np.ndarray, i: np.ndarray, j: np.ndarray, depth: int) -> tup
                 half = np.zeros(n, int)
                 half[order] = rank >= share * size[region[order]]
                 touched = np.zeros(n, bool)
-                touched[i[half[i] != half[j]]] = True
+                crossing = half[i] != half[j]
+                touched[i[crossing]] = touched[j[crossing]] = True
                 for which in (0, 1):
                     separator = touched & (half == which)
                     number = np.bincount(region[separator], minlength=2**tier)

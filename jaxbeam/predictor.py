@@ -22,12 +22,12 @@ TRUST = 0.25
 
 class Trail(NamedTuple):
     """The last states on a branch, newest first: parameters `s` `(q,)`, positions `x` `(q, n, 2)` and `slope`
-    `(q, n, 2)`, their derivatives in `s`. The first `count` `()` have a slope; the newest always has a position."""
+    `(q, n, 2)`, their derivatives in `s`. The first `depth` `()` have a slope; the newest always has a position."""
 
     s: jax.Array
     x: jax.Array
     slope: jax.Array
-    count: jax.Array
+    depth: jax.Array
 
 
 def begin(x: jax.Array, slope: jax.Array | None = None) -> Trail:
@@ -40,14 +40,14 @@ def begin(x: jax.Array, slope: jax.Array | None = None) -> Trail:
 
 def ahead(trail: Trail, s: jax.Array) -> jax.Array:
     """How far `(n, 2)` the state at `s` lies from the newest one; zero while no slope is known."""
-    known = jnp.arange(STATES, dtype=jnp.int32) < trail.count
+    known = jnp.arange(STATES, dtype=jnp.int32) < trail.depth
     other = known[:, None] & known & ~jnp.eye(STATES, dtype=bool)
     gap = jnp.where(other, trail.s[:, None] - trail.s, 1)
     basis = jnp.prod(jnp.where(other, (s - trail.s) / gap, 1), axis=1) ** 2
     tilt = jnp.sum(jnp.where(other, 1 / gap, 0), axis=1)
     of_values = jnp.where(known, (1 - 2 * tilt * (s - trail.s)) * basis, 0)
     of_slopes = jnp.where(known, (s - trail.s) * basis, 0)
-    straight = jnp.where(trail.count > 0, (s - trail.s[0]) * trail.slope[0], 0)
+    straight = jnp.where(trail.depth > 0, (s - trail.s[0]) * trail.slope[0], 0)
     curved = jnp.tensordot(of_values, trail.x - trail.x[0], 1) + jnp.tensordot(of_slopes, trail.slope, 1)
     return jnp.where(_near(curved, straight, straight), curved, straight)
 
@@ -57,8 +57,8 @@ def extend(trail: Trail, s: jax.Array, x: jax.Array, slope: jax.Array, guess: ja
     newest one, and where its own slope is not `known`."""
     leads = known & _near(x - trail.x[0], guess, guess)
     push = lambda all, new: jnp.concatenate([new[None], all[:-1]])
-    count = jnp.where(leads, jnp.minimum(trail.count + 1, STATES), known.astype(jnp.int32))
-    return Trail(push(trail.s, s), push(trail.x, x), push(trail.slope, slope), count)
+    depth = jnp.where(leads, jnp.minimum(trail.depth + 1, STATES), known.astype(jnp.int32))
+    return Trail(push(trail.s, s), push(trail.x, x), push(trail.slope, slope), depth)
 
 
 def _near(a: jax.Array, b: jax.Array, length: jax.Array) -> jax.Array:

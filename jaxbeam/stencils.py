@@ -29,7 +29,7 @@ def stencil_gradients(term: Term, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.vmap(jax.value_and_grad(term.energy))(positions, term.params)
     gradients, weights, (density, *stress) = _at_points(_value_and_stress, term.energy, positions, term.params)
     first = weights * jnp.stack(stress).reshape(2, 2, *weights.shape)
-    forces = sum(gradients[:, k, None] * first[None, :, k] for k in range(2))
+    forces = gradients[:, 0, None] * first[None, :, 0] + gradients[:, 1, None] * first[None, :, 1]
     return jnp.sum(weights * density, axis=0), jnp.moveaxis(jnp.sum(forces, axis=-2), -1, 0)
 
 
@@ -43,8 +43,9 @@ def stencil_hessian(term: Term, x: jax.Array) -> jax.Array:
     gradients, weights, stiffness = _at_points(_stiffness, term.energy, positions, term.params)
     second = weights * jnp.stack(stiffness).reshape(2, 2, 2, 2, *weights.shape)
     # (a, i, j, l) and then (a, i, b, j); the last two axes are the points and the elements.
-    half = sum(gradients[:, k, None, None, None] * second[None, :, k] for k in range(2))
-    whole = sum(half[:, :, None, :, k] * gradients[None, None, :, None, k] for k in range(2))
+    left, right = gradients[:, :, None, None, None], gradients[None, None, :, None]
+    half = left[:, 0] * second[None, :, 0] + left[:, 1] * second[None, :, 1]
+    whole = half[:, :, None, :, 0] * right[:, :, :, :, 0] + half[:, :, None, :, 1] * right[:, :, :, :, 1]
     return jnp.sum(whole, axis=-2).reshape(k * d, k * d, m)
 
 
@@ -54,7 +55,7 @@ def _at_points(
     """Shape-function gradients `(k, 2, q, m)`, weights `(q, m)`, and a derivative of the density at each point."""
     gradients = jnp.transpose(params.gradients, (2, 3, 1, 0))
     moved = jnp.moveaxis(x - params.rest, 0, -1)
-    H = sum(moved[a, :, None, None] * gradients[a, None] for a in range(moved.shape[0]))
+    H = jnp.sum(moved[:, :, None, None] * gradients[:, None], axis=0)
     components = [H[i, k] for i in range(2) for k in range(2)]
     of_one = lambda H, material: derivative(energy.density, H, material)
     each = jax.vmap(jax.vmap(of_one), in_axes=(0, None))(components, params.material)

@@ -29,7 +29,7 @@ from jaxbeam.follow import follow
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout, expand, gather
 from jaxbeam.newton import Newton, topology
-from jaxbeam.predictor import STATES, Trail
+from jaxbeam.predictor import STATES, Trail, ahead
 from jaxbeam.scene import Scene, command, energy, partway
 from jaxbeam.solution import Solution
 
@@ -149,7 +149,8 @@ def _continue(
     loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * here + s * ratios)
     trail = _trail(chunk, parent, ratios)
-    path, factor, after = follow(scene_at, layout, trail, jnp.ones(1, chunk.x.dtype), solver)
+    one = jnp.ones((), chunk.x.dtype)
+    path, factor, after = follow(scene_at, layout, trail, one[None], solver, way=ahead(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
     slope = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
     pull = lambda e: gather(layout, jax.jvp(slope, (ratios,), (e,))[1])
@@ -157,7 +158,7 @@ def _continue(
     moves = solver.linear.solve(layout, factor, pulls)
     drift = jax.vmap(lambda v: expand(layout, -v, found.x.shape), in_axes=1)(moves)
     good = found.status == 0
-    known = good & (after.count > 0) & jnp.all(jnp.isfinite(drift))
+    known = good & (after.depth > 0) & jnp.all(jnp.isfinite(drift))
     return Chunk(
         ratios=chunk.ratios,
         loaded=chunk.loaded,
@@ -166,7 +167,7 @@ def _continue(
         usable=chunk.usable.at[lane].set(good),
         known=chunk.known.at[lane].set(known),
         parent=chunk.parent.at[lane].set(parent),
-        joined=chunk.joined.at[lane].set((after.count > 1) & (found.attempts == 1)),
+        joined=chunk.joined.at[lane].set((after.depth > 1) & (found.attempts == 1)),
     ), found
 
 

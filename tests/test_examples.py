@@ -17,6 +17,7 @@ NUMBERS = {
     "06_follow_path": {"lowest ratio": 0.4667},
     "07_design_shape": {"before": 0.060367},
     "08_gradient_check": {"top command": -37.0783, "bottom command": 6.6988, "Hessian's order": 3.00},
+    "09_sweep_many": {"solved": 1.0, "highest": 35.5152802, "lowest": -34.9502718},
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
@@ -27,6 +28,7 @@ PICTURES = {
     "06_follow_path": {"path.png", "path.gif"},
     "07_design_shape": {"design.png"},
     "08_gradient_check": {"gradient_check.png"},
+    "09_sweep_many": {"map.png", "reachable_set.png"},
 }
 
 

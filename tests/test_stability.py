@@ -158,8 +158,8 @@ def test_indefinite_solution_and_inertia(name):
     hessians = []
     for stencil in structure.stencils:
         m, k = stencil.array.shape
-        root = rng.normal(size=(m, 2 * k, 2 * k))
-        hessians.append(root + np.swapaxes(root, 1, 2))
+        root = rng.normal(size=(2 * k, 2 * k, m))
+        hessians.append(root + np.swapaxes(root, 0, 1))
     free = np.flatnonzero(~structure.fixed.array.ravel())
     matrix = assembled(structure, hessians)[np.ix_(free, free)]
     values = np.linalg.eigvalsh(matrix)
