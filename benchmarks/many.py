@@ -5,15 +5,18 @@
 The sweep takes ratios (1 + d, 1 - d) with d in [-0.4, 0.4], each to a relative residual of 1e-9. In turn with it, in
 the same process: `lax.map` over `equilibrium` on every 16th of them, and simkit, which ramps each one in 28 steps, on
 four of them (see `benchmarks/simkit_peer.py`). Sweeps of 64 and of 4,096 asymmetries show whether a scene costs as
-much in a batch of any size, and what memory that takes. One thread, but for one row with as many as there are cores.
-Every answer is verified by code that shares nothing with the solvers.
+much in a batch of any size, and what memory that takes. One thread, but for a table with all cores. Every answer is
+verified by code that shares nothing with the solvers.
 """
 
 from __future__ import annotations
 
 import benchmarks.one_thread  # isort: skip # noqa: F401
 
+import json
 import os
+import subprocess
+import sys
 import time
 from functools import partial
 from typing import Any
@@ -60,7 +63,6 @@ def sweeps(repeats: int) -> dict[str, Any]:
     four = rows[[0, 300, 700, 1023]]
     runs = {
         "sweep of 1,024": (partial(on, 1, scene, rows), rows),
-        f"sweep of 1,024, {CORES} threads": (partial(on, CORES, scene, rows), rows),
         "sweep of 64": (partial(on, 1, scene, asymmetries(64)), asymmetries(64)),
         "sweep of 4,096": (partial(on, 1, scene, asymmetries(4096)), asymmetries(4096)),
         "lax.map over equilibrium": (lambda: mapped(few), rows[SAMPLE]),
@@ -99,14 +101,31 @@ def sweeps(repeats: int) -> dict[str, Any]:
     return {"sweeps": results, "peak memory": report.peak_memory()}
 
 
+def threads(repeats: int) -> dict[str, float]:
+    """Seconds of the sweep on one core and on all, in turn, where XLA may use them."""
+    scene, rows = jb.tendon_beam(), asymmetries(1024)
+    one, all = medians(partial(on, 1, scene, rows), partial(on, CORES, scene, rows), repeats=repeats)
+    return {"one thread": one.median, f"{CORES} threads": all.median, "gain": one.median / all.median}
+
+
+def threads_apart(repeats: int) -> dict[str, float]:
+    """The same in a new process: this one is kept to one thread."""
+    script = f"import json; from benchmarks import many; print(json.dumps(many.threads({repeats})))"
+    script = f"import jax; jax.config.update('jax_enable_x64', True); {script}"
+    settings = {"OPENBLAS_NUM_THREADS": "1", "NPROC": str(CORES)}
+    process = subprocess.run(
+        [sys.executable, "-c", script], env=dict(os.environ) | settings, stdout=subprocess.PIPE, check=True, text=True
+    )
+    return json.loads(process.stdout.splitlines()[-1])
+
+
 def reachable(repeats: int, side: int = 64) -> tuple[dict[str, Any], Figure]:
     """The map of a grid of commands, and what it took."""
     scene = jb.tendon_beam()
     values = np.linspace(0.4, 1.0, side)
     rows = np.stack([a.ravel() for a in np.meshgrid(values, values, indexing="ij")], axis=1)
-    runs = [partial(on, cores, scene, rows) for cores in (1, CORES)]
     kept: list[jb.Solution] = []
-    times = medians(*runs, repeats=repeats, checks=[kept.append, kept.append])
+    (timing,) = medians(partial(on, 1, scene, rows), repeats=repeats, checks=[kept.append])
     found = kept[-1]
     good = np.asarray(found.status) == 0
     raw = reference.problem(scene)
@@ -123,8 +142,7 @@ def reachable(repeats: int, side: int = 64) -> tuple[dict[str, Any], Figure]:
         figure.colorbar(shades, label=label, extend="neither" if colours == "RdBu_r" else "max")
     outcome = {
         "commands": len(rows),
-        "seconds, one thread": times[0].median,
-        f"seconds, {CORES} threads": times[1].median,
+        "seconds, one thread": timing.median,
         "solved": float(good.mean()),
         "steps a scene": float(np.mean(found.steps)),
         "residual": worst,
@@ -142,6 +160,8 @@ def main(arguments: list[str] | None = None) -> None:
     keys = list(found["sweeps"][0])
     report.table(("", *keys[1:]), [tuple(row.get(key) for key in keys) for row in found["sweeps"]])
     print(f"peak memory {found['peak memory'] / 2**20:.0f} MB\n")
+    found["threads"] = threads_apart(options.repeats)
+    report.table(tuple(found["threads"]), [tuple(found["threads"].values())])
     outcome, figure = reachable(max(1, options.repeats // 2))
     report.table(tuple(outcome), [tuple(outcome.values())])
     report.save(options.out, "many", found | {"reachable set": outcome})

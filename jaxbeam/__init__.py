@@ -15,6 +15,8 @@ from jaxbeam.design import History as History
 from jaxbeam.design import minimise as minimise
 from jaxbeam.design import reach as reach
 from jaxbeam.design import reach_each as reach_each
+from jaxbeam.dissection import Automatic as Automatic
+from jaxbeam.dissection import NestedDissection as NestedDissection
 from jaxbeam.equilibrium import equilibrium as equilibrium
 from jaxbeam.linear import BlockTridiagonal as BlockTridiagonal
 from jaxbeam.linear import Dense as Dense

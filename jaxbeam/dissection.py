@@ -29,7 +29,8 @@ from jaxbeam._tree import pytree, static_field, to_device
 from jaxbeam.linear import BlockTridiagonal, Topology, _blocks
 from jaxbeam.ordering import TILE, Couplings, Fronts, couplings, fronts, running
 
-# Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See `automatic`.
+# Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See
+# `choose_solver`.
 CROSSOVER = 1.2e9
 # Triangular tiles up to this size are inverted by LAPACK, larger ones by halves.
 SMALL = 16
@@ -188,7 +189,7 @@ def _eliminate(layout: DissectionLayout, definite: bool, f: jax.Array, carry: An
         a = reduced(_tile(tiles, place(j, j)), j, j, j, carry)
         w, d, bad = (_cholesky_pivot if definite else _any_pivot)(a)
         tiles, work = _put(tiles, w, place(j, j)), _put(work, w.T, AREA * j)
-        if not definite:
+        if d is not None:
             sign = lax.dynamic_update_slice_in_dim(sign, d, layout.rows[info[ROWS] + j * TILE], 0)
 
         def below(i: jax.Array, carry: Any) -> Any:
@@ -471,7 +472,7 @@ def _device_layout(
         )
 
 
-def automatic(topology: Topology) -> BlockTridiagonal | NestedDissection:
+def choose_solver(topology: Topology) -> BlockTridiagonal | NestedDissection:
     """The solver that is faster for a topology, by the work of the block-tridiagonal one.
 
     Factor and solve on one busy core, in milliseconds of processor time:
@@ -488,3 +489,28 @@ def automatic(topology: Topology) -> BlockTridiagonal | NestedDissection:
     width = np.bincount(_blocks(topology), (~fixed).sum(axis=1)).max()
     work = 7 / 3 * np.logical_not(fixed).sum() * width**2
     return BlockTridiagonal() if work < CROSSOVER else NestedDissection()
+
+
+@dataclasses.dataclass(frozen=True)
+class Automatic:
+    """The default: `BlockTridiagonal` or `NestedDissection`, whichever is faster for the scene (`choose_solver`)."""
+
+    def layout(self, topology: Topology) -> Any:
+        return choose_solver(topology).layout(topology)
+
+    def factor(self, layout: Any, storage: jax.Array) -> tuple[Any, jax.Array]:
+        return _made(layout).factor(layout, storage)
+
+    def solve(self, layout: Any, factor: Any, rhs: jax.Array) -> jax.Array:
+        return _made(layout).solve(layout, factor, rhs)
+
+    def factor_indefinite(self, layout: Any, storage: jax.Array) -> tuple[Any, jax.Array]:
+        return _made(layout).factor_indefinite(layout, storage)
+
+    def solve_indefinite(self, layout: Any, factor: Any, rhs: jax.Array) -> jax.Array:
+        return _made(layout).solve_indefinite(layout, factor, rhs)
+
+
+def _made(layout: Any) -> Any:
+    """The solver that a layout is of."""
+    return NestedDissection() if isinstance(layout, DissectionLayout) else BlockTridiagonal()

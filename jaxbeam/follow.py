@@ -116,9 +116,11 @@ def follow(
         scene = scene_at(walk.trial)
         budget = jnp.minimum(ATTEMPT_STEPS * (1 + walk.cuts), solver.max_steps - walk.spent[0])
         slope_at = lambda s, x: jax.grad(energy, argnums=1)(scene_at(s), x)
-        probes = lambda x: jnp.stack([jax.jvp(lambda s: slope_at(s, x), (walk.trial,), (zero + 1,))[1], noise])
+        rate = lambda x: jax.jvp(lambda s: slope_at(s, x), (walk.trial,), (zero + 1,))[1]
+        # What gives the tangent of the branch; at a saddle its soft modes, which the factor there filters out of noise.
+        probe = lambda x, definite: jnp.where(definite, rate(x), noise)
         free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
-        state = newton(scene, layout, walk.start, walk.way, jnp.where(walk.over, 0, budget), free, probes, solver)
+        state = newton(scene, layout, walk.start, walk.way, jnp.where(walk.over, 0, budget), free, probe, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
         steps, attempts, status = counts[0], counts[3], counts[-1]
 
@@ -133,9 +135,8 @@ def follow(
         failed = ~good & ~saddle
         over = (~landed & spent_out) | (failed & ~may_cut)
 
-        tangent, soft = state.aside
-        known = state.definite & jnp.all(jnp.isfinite(tangent))
-        trail = choose(good, extend(trail, walk.trial, state.x, tangent, walk.way, known), trail)
+        known = state.definite & jnp.all(jnp.isfinite(state.aside))
+        trail = choose(good, extend(trail, walk.trial, state.x, state.aside, walk.way, known), trail)
         cut = jnp.where(saddle, walk.increment, 0.5 * (walk.trial - trail.s[0]))
         # A target reached at once invites to walk straight to the next one.
         easy = landed & ((attempts == 1) | (walk.increment <= 0))
@@ -146,9 +147,10 @@ def follow(
         far = over | (trail.s[0] + 1.01 * increment >= targets[leg])
         leave = saddle & ~over
         trial = jnp.where(leave, walk.trial, jnp.where(far, targets[leg], onward))
-        # From a saddle along its soft modes, as the factor of the Hessian there filters them out of noise.
-        off = ESCAPE * jnp.max(jnp.abs(state.x)) / jnp.max(jnp.abs(soft))
-        way = jnp.where(leave, jnp.where(jnp.isfinite(off), off * soft, 0), jnp.where(over, 0, ahead(trail, trial)))
+        off = ESCAPE * jnp.max(jnp.abs(state.x)) / jnp.max(jnp.abs(state.aside))
+        way = jnp.where(
+            leave, jnp.where(jnp.isfinite(off), off * state.aside, 0), jnp.where(over, 0, ahead(trail, trial))
+        )
 
         # A target given up: where that is, as judged by the target's own forces.
         reached = trail.s[0] / jnp.where(target > 0, target, 1)

@@ -208,9 +208,9 @@ class BlockTridiagonal:
         # Right-hand sides are rows here, so that the products below can be plain loops.
         k = rhs.size // len(rhs)
         inner, outer = rhs[: b * w].reshape(b, w, k).swapaxes(1, 2), rhs[b * w :].reshape(r, k)
-        solve = lambda pivot, y, transpose: lax.linalg.triangular_solve(
-            pivot, y.T, left_side=True, lower=True, transpose_a=transpose
-        ).T
+        solve = lambda pivot, y, transpose: (
+            lax.linalg.triangular_solve(pivot, y.T, left_side=True, lower=True, transpose_a=transpose).T
+        )
 
         def forward(above: jax.Array, block: Any) -> Any:
             pivot, lower, right = block

@@ -21,7 +21,8 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Key, blank, choose
-from jaxbeam.linear import BlockTridiagonal, Layout, LinearSolver, Topology, assemble, expand, gather
+from jaxbeam.dissection import Automatic
+from jaxbeam.linear import Layout, LinearSolver, Topology, assemble, expand, gather
 from jaxbeam.linear import project_semidefinite as project
 from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
 
@@ -32,7 +33,8 @@ class Newton:
 
     max_steps: Newton steps before giving up on one equilibrium, all attempts at it together.
     rtol: relative residual to reach; by default 1e-10 in float64 and 1e-6 in float32.
-    linear: the linear solver, `BlockTridiagonal()` or `Dense()`.
+    linear: the linear solver, `BlockTridiagonal()`, `NestedDissection()` or `Dense()`; by default one of the first two,
+        by what it would cost.
     keep_volume: no element falls below this fraction of its `J` in one step. It keeps elements from
         inverting within a step, and logarithmic energies finite.
     escape: leave a saddle along its lowest mode for the stable equilibrium beside it. Without it a saddle
@@ -41,7 +43,7 @@ class Newton:
 
     max_steps: int = 2000
     rtol: float | None = None
-    linear: LinearSolver = BlockTridiagonal()
+    linear: LinearSolver = Automatic()
     keep_volume: float = 0.1
     escape: bool = True
 
@@ -92,7 +94,7 @@ class State(NamedTuple):
 
     `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so; `marginal` if a
     shift by no more than round-off did it, which leaves its sign open. `step` `(n, 2)` is the step to take next and
-    `aside` `(k, n, 2)` how `x` would move under the probes.
+    `aside` `(n, 2)` how `x` would move under the probe.
     """
 
     x: jax.Array
@@ -115,15 +117,15 @@ def newton(
     ahead: jax.Array,
     budget: jax.Array,
     free: jax.Array,
-    probes: Callable[[jax.Array], jax.Array],
+    probe: Callable[[jax.Array, jax.Array], jax.Array],
     solver: Newton,
 ) -> State:
     """Newton's method from `x + ahead`, for a scene with unlocked indices; to be called inside jit.
 
     It starts as far along `ahead` as no element inverts, and takes at most `budget` steps. The first `free` of them
     need not lower the energy, as long as the true Hessian is positive definite. The state it ends in holds the factor
-    of the Hessian at `x`. `probes(x)` are nodal forces `(k, n, 2)` that are solved for beside the unbalanced ones: a
-    column more costs next to nothing.
+    of the Hessian at `x`. `probe(x, definite)` are nodal forces `(n, 2)` that are solved for beside the unbalanced
+    ones: a column more costs next to nothing.
     """
     rtol = solver.tolerance(x.dtype)
     zero, nothing, yes = jnp.zeros((), x.dtype), jnp.zeros_like(x), jnp.asarray(True)
@@ -134,7 +136,7 @@ def newton(
         definite=yes,
         marginal=~yes,
         step=ahead,
-        aside=blank(probes, x),
+        aside=nothing,
         residual=jnp.asarray(jnp.inf, x.dtype),
         counts=jnp.zeros(4, jnp.int32),
         fresh=yes,
@@ -151,7 +153,7 @@ def newton(
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
         rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
         factor, definite, marginal = factorise(layout, hessians, storage, jnp.isfinite(residual), solver)
-        pulls = jnp.concatenate([at.gradient[None], probes(x)])
+        pulls = jnp.stack([at.gradient, probe(x, definite)])
         moves = solver.linear.solve(layout, factor, jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls))
         moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
         # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
@@ -169,7 +171,7 @@ def newton(
             definite=definite,
             marginal=marginal,
             step=moves[0],
-            aside=moves[1:],
+            aside=moves[1],
             residual=residual,
             counts=counts,
             fresh=~yes,

@@ -119,7 +119,9 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         joined=no,
     )
 
-    # A command that fails is begun again at rest: `follow` is traced once for both.
+    first = Lane(*jax.eval_shape(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver)))
+    blank_of = lambda *lead: lambda leaf: jnp.zeros((*lead, *leaf.shape), leaf.dtype)
+
     def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
         chunk, all = carry
         lane = order[k]
@@ -127,24 +129,39 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         nearest = jnp.argmin(jnp.where(chunk.usable, near, jnp.inf)).astype(jnp.int32)
 
         def attempt(carry: Any) -> Any:
-            parent, _, chunk, all = carry
-            chunk, found = _continue(scene, layout, chunk, lane, parent, solver)
-            all = jax.tree.map(lambda many, new: many.at[lane].set(new), all, found)
-            again = (found.status != 0) & (parent != size)
-            return jnp.asarray(size, jnp.int32), again, chunk, all
+            parent, _, _ = carry
+            found = _continue(scene, layout, chunk, lane, parent, solver)
+            # One that fails is begun again at rest.
+            again = (found.solution.status != 0) & (parent != size)
+            return jnp.where(again, size, parent), again, found
 
-        _, _, chunk, all = lax.while_loop(lambda c: c[1], attempt, (nearest, jnp.asarray(True), chunk, all))
-        return chunk, all
+        begin = (nearest, jnp.asarray(True), jax.tree.map(blank_of(), first))
+        parent, _, found = lax.while_loop(lambda c: c[1], attempt, begin)
+        good = found.solution.status == 0
+        chunk = chunk._replace(
+            x=chunk.x.at[lane].set(found.solution.x),
+            drift=chunk.drift.at[lane].set(found.drift),
+            usable=chunk.usable.at[lane].set(good),
+            known=chunk.known.at[lane].set(good & found.known),
+            parent=chunk.parent.at[lane].set(parent),
+            joined=chunk.joined.at[lane].set(found.joined),
+        )
+        return chunk, jax.tree.map(lambda many, new: many.at[lane].set(new), all, found.solution)
 
-    single = jax.eval_shape(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver)[1])
-    none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), single)
-    return lax.fori_loop(0, count, one, (chunk, none))[1]
+    return lax.fori_loop(0, count, one, (chunk, jax.tree.map(blank_of(size), first.solution)))[1]
 
 
-def _continue(
-    scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, parent: jax.Array, solver: Newton
-) -> tuple[Chunk, Solution]:
-    """The equilibrium of a lane, continued from that of its parent, and the chunk with it."""
+class Lane(NamedTuple):
+    """What comes of one command: its solution, the drift of that, whether it is known, and joined to its parent."""
+
+    solution: Solution
+    drift: jax.Array
+    known: jax.Array
+    joined: jax.Array
+
+
+def _continue(scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, parent: jax.Array, solver: Newton) -> Lane:
+    """The equilibrium of a lane, continued from that of its parent."""
     ratios, here = chunk.ratios[lane], chunk.ratios[parent]
     loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * here + s * ratios)
@@ -157,18 +174,8 @@ def _continue(
     pulls = jax.vmap(pull, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
     moves = solver.linear.solve(layout, factor, pulls)
     drift = jax.vmap(lambda v: expand(layout, -v, found.x.shape), in_axes=1)(moves)
-    good = found.status == 0
-    known = good & (after.depth > 0) & jnp.all(jnp.isfinite(drift))
-    return Chunk(
-        ratios=chunk.ratios,
-        loaded=chunk.loaded,
-        x=chunk.x.at[lane].set(found.x),
-        drift=chunk.drift.at[lane].set(drift),
-        usable=chunk.usable.at[lane].set(good),
-        known=chunk.known.at[lane].set(known),
-        parent=chunk.parent.at[lane].set(parent),
-        joined=chunk.joined.at[lane].set((after.depth > 1) & (found.attempts == 1)),
-    ), found
+    known = (after.depth > 0) & jnp.all(jnp.isfinite(drift))
+    return Lane(found, drift, known, (after.depth > 1) & (found.attempts == 1))
 
 
 def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:

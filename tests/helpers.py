@@ -154,7 +154,7 @@ def central_difference(f, x: np.ndarray, h: float) -> np.ndarray:
 
 
 def assembled(topology: Topology, hessians: list[np.ndarray]) -> np.ndarray:
-    """Matrix over all coordinates of a sum of stencil matrices, entry by entry in NumPy. One `(s, s, m)` array for each stencil."""
+    """Matrix over all coordinates of a sum of stencil matrices `(s, s, m)`, entry by entry in NumPy."""
     size = topology.fixed.array.size
     matrix = np.zeros((size, size))
     for stencil, hessian in zip(topology.stencils, hessians, strict=True):

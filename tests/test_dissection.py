@@ -11,7 +11,7 @@ from test_linear import CASES, case, check_solver, structure_of
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
-from jaxbeam.dissection import NestedDissection, automatic
+from jaxbeam.dissection import NestedDissection, choose_solver
 from jaxbeam.equilibrium import topology
 from jaxbeam.linear import Topology, assemble, expand, gather
 
@@ -161,8 +161,8 @@ def test_equilibrium_and_its_gradient(beam):
 
 
 def test_choice_by_size(beam):
-    assert automatic(topology(beam)) == jb.BlockTridiagonal()
-    assert automatic(topology(jb.tendon_beam(449, 97))) == NestedDissection()
+    assert choose_solver(topology(beam)) == jb.BlockTridiagonal()
+    assert choose_solver(topology(jb.tendon_beam(449, 97))) == NestedDissection()
 
 
 def test_layout_is_computed_once_for_equal_structure(beam):

@@ -22,8 +22,8 @@ from helpers import (
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
-from jaxbeam.newton import topology
 from jaxbeam.linear import Topology, assemble, expand, gather, project_semidefinite
+from jaxbeam.newton import topology
 from jaxbeam.scene import stencil_hessians
 
 # ----------------------------------------------------------------------------------------- projection
