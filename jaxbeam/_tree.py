@@ -178,8 +178,11 @@ COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if (0, 10) <= jax.__ve
 
 
 def _outside() -> bool:
-    """Whether this is run, not traced."""
-    return is_concrete(jax.device_put(0))
+    """Whether this is run, not traced: what a jitted function returns is a tracer inside another one."""
+    return is_concrete(_zero())
+
+
+_zero = jax.jit(lambda: np.int32(0))
 
 
 def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:

@@ -472,6 +472,7 @@ def _device_layout(
         )
 
 
+@lru_cache(maxsize=64)
 def choose_solver(topology: Topology) -> BlockTridiagonal | NestedDissection:
     """The solver that is faster for a topology, by the work of the block-tridiagonal one.
 
