@@ -48,14 +48,14 @@ def draw_map(ratios: np.ndarray, angles: np.ndarray, bad: np.ndarray) -> Figure:
 
 def draw_reach(scene: jb.Scene, tips: np.ndarray, angles: np.ndarray, bad: np.ndarray, x: np.ndarray) -> Figure:
     """The tip positions of all commands, with the beam at rest and at the two ends of its reach."""
-    figure = Figure(figsize=(6.2, 5.0), layout="constrained")
+    figure = Figure(figsize=(4.9, 5.2), layout="constrained")
     ax = figure.add_subplot(xlabel="x (length units)", ylabel="y (length units)", aspect="equal")
     corners = scene.mesh.elements[:, [0, 1, 2, 0]]
     for k in (int(np.argmin(angles)), int(np.argmax(angles))):
         ax.plot(*x[k][corners].transpose(2, 1, 0), color="0.82", linewidth=0.4, zorder=0)
     ax.plot(*np.asarray(scene.mesh.nodes)[corners].transpose(2, 1, 0), color="0.7", linewidth=0.4, zorder=0)
     across, up = tips[~bad].T
-    dots = ax.scatter(across, up, c=angles[~bad], s=3, cmap="RdBu_r", norm=TwoSlopeNorm(0, -38, 38), linewidths=0)
+    dots = ax.scatter(across, up, c=angles[~bad], s=3, cmap="coolwarm", norm=TwoSlopeNorm(0, -38, 38), linewidths=0)
     figure.colorbar(dots, label="tip angle (degrees)", ticks=np.arange(-30, 31, 10), shrink=0.8)
     ax.spines[["top", "right"]].set_visible(False)
     return figure
