@@ -451,25 +451,23 @@ def _device_layout(
     if max(plan.totals[0] // 4, plan.totals[1]) >= NONE:
         raise ValueError(f"mesh: its factor would hold {plan.totals[0]} numbers, too many; use a coarser mesh")
     front = np.stack([plan.pivots, plan.pivots + plan.rest, plan.factor, plan.update, plan.rows], axis=1)
-    signed = lambda a: to_device(a.astype(np.int32))
+    signed = lambda a: to_device(a, np.int32)
     # Unsigned, so that JAX does not look for negative ones.
-    unsigned = lambda a: to_device(a.astype(np.uint32))
-    # Cached across calls, so it must not be a tracer of the call that made it.
-    with jax.ensure_compile_time_eval():
-        return DissectionLayout(
-            signed(slots),
-            signed(position),
-            tuple(signed(a.T) for a in scatter),
-            signed(diagonal),
-            to_device(empty),
-            unsigned(place),
-            signed(np.concatenate([front, rows.ranges], axis=1)),
-            signed(rows.rows),
-            signed(rows.edge),
-            unsigned(rows.row),
-            unsigned(rows.column),
-            (*plan.totals[:2], max(int(plan.pivots.max()), 1) * AREA),
-        )
+    unsigned = lambda a: to_device(a, np.uint32)
+    return DissectionLayout(
+        signed(slots),
+        signed(position),
+        tuple(signed(a.T) for a in scatter),
+        signed(diagonal),
+        to_device(empty),
+        unsigned(place),
+        signed(np.concatenate([front, rows.ranges], axis=1)),
+        signed(rows.rows),
+        signed(rows.edge),
+        unsigned(rows.row),
+        unsigned(rows.column),
+        (*plan.totals[:2], max(int(plan.pivots.max()), 1) * AREA),
+    )
 
 
 @lru_cache(maxsize=64)

@@ -78,11 +78,10 @@ def follow(
     """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
 
     The first attempt goes straight to the first target: from `x`, or else from the end of `trail` and `way` ahead of
-    it, by default along its tangent. One that fails
-    is made in smaller steps, from the last good state (at first: the newest of `trail`, at `s = 0`), along the branch
-    as it was so far; steps grow again while they succeed. When they have become too small the walk ends: what remains
-    is reported `NOT_CONVERGED`, at the last good state. Returned with them are the factor of the stiffness at
-    the last, and the trail that ends there.
+    it, by default along its tangent. One that fails is made in smaller steps, from the last good state (at first: the
+    newest of `trail`, at `s = 0`), along the branch as it was so far; steps grow again while they succeed. When they
+    have become too small the walk ends: what remains is reported `NOT_CONVERGED`, at the last good state. Returned with
+    them are the factor of the stiffness at the last, and the trail that ends there.
     """
     last, rest = targets.shape[0] - 1, trail.x[0]
     count, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), rest.dtype), jnp.asarray(False)

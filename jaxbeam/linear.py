@@ -358,6 +358,7 @@ def _bordered_layout(topology: Topology) -> Layout:
     return _device_layout(slots, position, scatter, diagonal, empty, (b, w, r))
 
 
+@lru_cache(maxsize=32)
 def _blocks(topology: Topology) -> np.ndarray:
     """Block of each node: breadth-first levels, narrow neighbours merged. The cheapest of a few roots."""
     fixed = topology.fixed.array
@@ -404,17 +405,20 @@ def _levels(root: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> np.n
     """Breadth-first level of each node; a further piece of the mesh continues the count."""
     start, neighbour = neighbours
     level = np.full(start.size - 1, -1)
-    front, depth = np.asarray(root), 0
+    front, depth, seen = np.asarray(root), 0, 0
     while True:
         level[front] = depth
-        reached = np.concatenate([neighbour[start[node] : start[node + 1]] for node in front])
-        front = np.unique(reached[level[reached] < 0])
         depth += 1
+        degree = start[front + 1] - start[front]
+        at = np.repeat(start[front] - np.cumsum(degree) + degree, degree) + np.arange(degree.sum())
+        reached = neighbour[at]
+        front = np.unique(reached[level[reached] < 0])
         if not front.size:
-            rest = np.flatnonzero(level < 0)
-            if not rest.size:
+            while seen < level.size and level[seen] >= 0:
+                seen += 1
+            if seen == level.size:
                 return level
-            front = rest[:1]
+            front = np.array([seen])
 
 
 def _components(nodes: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
@@ -478,7 +482,6 @@ def _device_layout(
         raise ValueError(
             f"mesh: its factor would hold {empty.size} numbers, more than 32-bit indices address; use a coarser mesh"
         )
-    # Cached across calls, so it must not be a tracer of the call that made it.
-    with jax.ensure_compile_time_eval():
-        where = [to_device(a.astype(np.int32)) for a in (slots, position, diagonal, *(s.T for s in scatter))]
-        return Layout(where[0], where[1], tuple(where[3:]), where[2], to_device(empty), blocks)
+    index = lambda a: to_device(a, np.int32)
+    places = tuple(index(s.T) for s in scatter)
+    return Layout(index(slots), index(position), places, index(diagonal), to_device(empty), blocks)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbeam.linear import Topology
+from jaxbeam.linear import Topology, _levels
 
 # Rows of a tile. Microseconds to subtract a product of tiles, to invert a tile, to add to one what a front below passes
 # on, and that a front costs besides (one core of a Xeon of 2023). A second, larger size for large fronts gains a tenth
@@ -95,6 +95,7 @@ def _rank(order: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def couplings(topology: Topology) -> Couplings:
+    """The pairs of nodes that share a stencil, and where each stencil's are among them."""
     n = topology.fixed.array.shape[0]
     keys = [np.arange(n) * (n + 1)]
     for stencil in topology.stencils:
@@ -195,33 +196,15 @@ def _dissect(topology: Topology, leaf: int) -> tuple[np.ndarray, np.ndarray, int
 def _embed(n: int, i: np.ndarray, j: np.ndarray, pivots: int = 10) -> np.ndarray:
     """Coordinates `(n, pivots)` of the nodes of a graph: distances to a few far nodes (Harel and Koren 2002)."""
     start = np.searchsorted(i, np.arange(n + 1))
-    root = int(_distances(0, start, j).argmax())
+    distances = lambda root: _levels(np.array([root]), (start, j))
+    root = int(distances(0).argmax())
     nearest = np.full(n, n + 1)
     columns = []
     for _ in range(pivots):
-        columns.append(_distances(root, start, j))
+        columns.append(distances(root))
         nearest = np.minimum(nearest, columns[-1])
         root = int(nearest.argmax())
     return np.stack(columns, axis=1).astype(float)
-
-
-def _distances(root: int, start: np.ndarray, neighbour: np.ndarray) -> np.ndarray:
-    """Breadth-first level of each node; a further piece of the graph continues the count."""
-    level = np.full(start.size - 1, -1)
-    front, depth, seen = np.array([root]), 0, 0
-    while True:
-        level[front] = depth
-        depth += 1
-        degree = start[front + 1] - start[front]
-        at = np.repeat(start[front] - np.cumsum(degree) + degree, degree) + np.arange(degree.sum())
-        reached = neighbour[at]
-        front = np.unique(reached[level[reached] < 0])
-        if not front.size:
-            while seen < level.size and level[seen] >= 0:
-                seen += 1
-            if seen == level.size:
-                return level
-            front = np.array([seen])
 
 
 def _bisect(places: np.ndarray, i: np.ndarray, j: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:

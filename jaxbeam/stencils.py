@@ -7,7 +7,7 @@ quadrature point, so its density is differentiated in these and the chain rule d
 
 with `P = d psi / d H`, `D = d2 psi / d H2` and `g` the gradients of the shape functions (summed over `k`, `l`). Each
 component is a separate scalar until the end, and elements are the last axis of every array: XLA makes a few vectorised
-loops of it, forty times as fast as derivatives by six coordinates.
+loops of it, more than ten times as fast as derivatives by six coordinates.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import PartitionSpec
 
-from jaxbeam._tree import Numbers, compiled, is_concrete, to_device, unlock
+from jaxbeam._tree import Numbers, blank, compiled, is_concrete, to_device, unlock
 from jaxbeam.equilibrium import differentiable_rows
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
@@ -118,9 +118,7 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         parent=jnp.full(size + 1, size, jnp.int32),
         joined=no,
     )
-
-    first = Lane(*jax.eval_shape(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver)))
-    blank_of = lambda *lead: lambda leaf: jnp.zeros((*lead, *leaf.shape), leaf.dtype)
+    nothing = blank(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver))
 
     def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
         chunk, all = carry
@@ -135,7 +133,7 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
             again = (found.solution.status != 0) & (parent != size)
             return jnp.where(again, size, parent), again, found
 
-        begin = (nearest, jnp.asarray(True), jax.tree.map(blank_of(), first))
+        begin = (nearest, jnp.asarray(True), nothing)
         parent, _, found = lax.while_loop(lambda c: c[1], attempt, begin)
         good = found.solution.status == 0
         chunk = chunk._replace(
@@ -148,7 +146,8 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         )
         return chunk, jax.tree.map(lambda many, new: many.at[lane].set(new), all, found.solution)
 
-    return lax.fori_loop(0, count, one, (chunk, jax.tree.map(blank_of(size), first.solution)))[1]
+    none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), nothing.solution)
+    return lax.fori_loop(0, count, one, (chunk, none))[1]
 
 
 class Lane(NamedTuple):
@@ -243,7 +242,8 @@ def _everywhere(
     """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
     parts = _partition(rows, np.arange(len(rows)), size)
     processes, devices = jax.process_count(), tuple(jax.local_devices())
-    mine = parts[jax.process_index() :: processes]
+    # Where there are fewer parts than processes, one that has none solves the first for nothing: all must take part.
+    mine = parts[jax.process_index() :: processes] or parts[:1]
     jobs = [mine[k : k + len(devices)] for k in range(0, len(mine), len(devices))]
 
     def solve(job: list[np.ndarray]) -> list[Solution]:
@@ -273,7 +273,7 @@ def _gathered(mine: list[Solution], count: int) -> list[Solution]:
 
     processes = jax.process_count()
     most = -(-count // processes)
-    # Every process must bring as many, and there are more parts than processes or the caller has none to show.
+    # Every process must bring as many; what is too much is not looked at.
     padded = mine + [mine[-1]] * (most - len(mine))
     everyone = multihost_utils.process_allgather(jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
     return [jax.tree.map(lambda leaf, k=k: leaf[k % processes, k // processes], everyone) for k in range(count)]
