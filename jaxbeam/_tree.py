@@ -15,10 +15,12 @@ placeholders. Here unflattening bypasses it, so a constructor can validate what 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import gc
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -185,6 +187,18 @@ def _outside() -> bool:
 _zero = jax.jit(lambda: np.int32(0))
 
 
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without Python's search for reference cycles, which finds none in what tracing makes and takes a tenth of it."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
 def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Decorator: `jax.jit` with static arguments of these names, for the solver's own entry points.
 
@@ -202,7 +216,8 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
             if is_concrete(*jax.tree.leaves(values)) and _outside():
-                return outermost(**values, **settings)
+                with _uncollected():
+                    return outermost(**values, **settings)
             in_turn = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))
             return in_turn(values)
 

@@ -135,7 +135,10 @@ def follow(
         over = (~landed & spent_out) | (failed & ~may_cut)
 
         known = state.definite & jnp.all(jnp.isfinite(state.aside))
-        trail = choose(good, extend(trail, walk.trial, state.x, state.aside, walk.way, known), trail)
+        # The step that is not taken any more still tells where the branch lies, to twice as many digits as `rtol` asks
+        # for: a polynomial continued from there does not blow up what was left unbalanced.
+        settled = state.x + jnp.where(known & (correction(state.x, state.step) <= INACCURATE), state.step, 0)
+        trail = choose(good, extend(trail, walk.trial, settled, state.aside, walk.way, known), trail)
         cut = jnp.where(saddle, walk.increment, 0.5 * (walk.trial - trail.s[0]))
         # A target reached at once invites to walk straight to the next one.
         easy = landed & ((attempts == 1) | (walk.increment <= 0))

@@ -75,13 +75,12 @@ def _unit(H: list[jax.Array], which: int) -> list[jax.Array]:
 
 def _value_and_stress(density: Callable[..., jax.Array], H: list[jax.Array], material: Any) -> list[jax.Array]:
     """The density and its four first derivatives at one point."""
-    psi = lambda H: _of_components(density)(H, material)
-    return [psi(H), *(jax.jvp(psi, (H,), (_unit(H, i),))[1] for i in range(4))]
+    value, change = jax.linearize(lambda H: _of_components(density)(H, material), H)
+    return [value, *(change(_unit(H, i)) for i in range(4))]
 
 
 def _stiffness(density: Callable[..., jax.Array], H: list[jax.Array], material: Any) -> list[jax.Array]:
     """The sixteen second derivatives of the density at one point."""
-    psi = lambda H: _of_components(density)(H, material)
-    stress = lambda i: lambda H: jax.jvp(psi, (H,), (_unit(H, i),))[1]
-    upper = {(i, j): jax.jvp(stress(i), (H,), (_unit(H, j),))[1] for i in range(4) for j in range(i, 4)}
-    return [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
+    _, change = jax.linearize(lambda H: _value_and_stress(density, H, material)[1:], H)
+    columns = [change(_unit(H, j)) for j in range(4)]
+    return [columns[max(i, j)][min(i, j)] for i in range(4) for j in range(4)]

@@ -36,6 +36,11 @@ from jaxbeam.solution import Solution
 # Commands of a chunk, and the numbers that its states and tangents may take (half a gigabyte).
 CHUNK = 128
 MEMORY = 1 << 26
+# How far apart (in ratios) the states are, at least, that a prediction is made from: a polynomial through nearer ones
+# blows up their round-off, and that costs a Newton step.
+GAP = 0.005
+# Square of the sine of the angle within which two directions are one.
+STRAIGHT = 1e-12
 
 
 def sweep(
@@ -93,12 +98,11 @@ class Chunk(NamedTuple):
 
     ratios: jax.Array  # (C + 1, m)
     loaded: jax.Array  # (C + 1,) share of the dead loads: 0 at rest
-    x: jax.Array  # (C + 1, n, 2)
+    x: jax.Array  # (C + 1, n, 2) where the branch lies, closer than the solution (see `follow`)
     drift: jax.Array  # (C + 1, m, n, 2) derivative of x in each ratio
     usable: jax.Array  # (C + 1,) may be continued from
     known: jax.Array  # (C + 1,) its drift is known
-    parent: jax.Array  # (C + 1,) the place it was continued from,
-    joined: jax.Array  # (C + 1,) smoothly
+    anchor: jax.Array  # (C + 1,) the place farther back on its smooth branch that is remembered; C if there is none
 
 
 @compiled("solver")
@@ -115,16 +119,14 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         drift=jnp.zeros((size + 1, m, *rest.shape), rest.dtype),
         usable=no.at[-1].set(True),
         known=no,
-        parent=jnp.full(size + 1, size, jnp.int32),
-        joined=no,
+        anchor=jnp.full(size + 1, size, jnp.int32),
     )
-    nothing = blank(lambda: _continue(scene, layout, chunk, order[0], chunk.parent[0], solver))
+    nothing = blank(lambda: _continue(scene, layout, chunk, order[0], chunk.anchor[0], solver))
 
     def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
         chunk, all = carry
         lane = order[k]
-        near = jnp.sum((chunk.ratios - rows[lane]) ** 2, axis=1)
-        nearest = jnp.argmin(jnp.where(chunk.usable, near, jnp.inf)).astype(jnp.int32)
+        nearest = _nearest(chunk, rows[lane])
 
         def attempt(carry: Any) -> Any:
             parent, _, _ = carry
@@ -136,13 +138,15 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         begin = (nearest, jnp.asarray(True), nothing)
         parent, _, found = lax.while_loop(lambda c: c[1], attempt, begin)
         good = found.solution.status == 0
+        back = chunk.anchor[parent]
+        near = chunk.known[back] & (jnp.sum((chunk.ratios[parent] - chunk.ratios[back]) ** 2) < GAP**2)
+        anchor = jnp.where(found.joined, jnp.where(near, back, parent), size)
         chunk = chunk._replace(
-            x=chunk.x.at[lane].set(found.solution.x),
+            x=chunk.x.at[lane].set(found.x),
             drift=chunk.drift.at[lane].set(found.drift),
             usable=chunk.usable.at[lane].set(good),
             known=chunk.known.at[lane].set(good & found.known),
-            parent=chunk.parent.at[lane].set(parent),
-            joined=chunk.joined.at[lane].set(found.joined),
+            anchor=chunk.anchor.at[lane].set(anchor),
         )
         return chunk, jax.tree.map(lambda many, new: many.at[lane].set(new), all, found.solution)
 
@@ -151,9 +155,11 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
 
 
 class Lane(NamedTuple):
-    """What comes of one command: its solution, the drift of that, whether it is known, and joined to its parent."""
+    """What comes of one command: its solution, the branch and its drift there, whether that is known, and joined to its
+    parent."""
 
     solution: Solution
+    x: jax.Array
     drift: jax.Array
     known: jax.Array
     joined: jax.Array
@@ -174,23 +180,30 @@ def _continue(scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, paren
     moves = solver.linear.solve(layout, factor, pulls)
     drift = jax.vmap(lambda v: expand(layout, -v, found.x.shape), in_axes=1)(moves)
     known = (after.depth > 0) & jnp.all(jnp.isfinite(drift))
-    return Lane(found, drift, known, (after.depth > 1) & (found.attempts == 1))
+    return Lane(found, after.x[0], drift, known, (after.depth > 1) & (found.attempts == 1))
+
+
+def _nearest(chunk: Chunk, ratios: jax.Array) -> jax.Array:
+    """The place to continue from: the nearest, where one that has its anchor right behind it counts as half as far."""
+    ahead, behind = ratios - chunk.ratios, chunk.ratios - chunk.ratios[chunk.anchor]
+    far, along = jnp.sum(ahead**2, axis=1), jnp.sum(ahead * behind, axis=1)
+    straight = chunk.known[chunk.anchor] & (along > 0) & (along**2 >= (1 - STRAIGHT) * far * jnp.sum(behind**2, axis=1))
+    return jnp.argmin(jnp.where(chunk.usable, jnp.where(straight, 0.25, 1.0) * far, jnp.inf)).astype(jnp.int32)
 
 
 def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
-    """The trail from the ancestors that lie on the line from the parent on to `ratios`: the parent at `s = 0`."""
+    """The trail from the anchors that lie on the line from the parent on to `ratios`: the parent at `s = 0`."""
     direction = ratios - chunk.ratios[parent]
     length = jnp.sum(direction**2)
     places, s, fits = [parent], [jnp.zeros((), ratios.dtype)], [chunk.known[parent]]
     for _ in range(STATES - 1):
-        last = places[-1]
-        place = chunk.parent[last]
+        place = chunk.anchor[places[-1]]
         back = chunk.ratios[place] - chunk.ratios[parent]
         along = jnp.sum(back * direction) / jnp.where(length > 0, length, 1)
         aside = jnp.sum((back - along * direction) ** 2)
         # Farther back by more than a hair, or the polynomial through both is ill-defined.
         behind = along < s[-1] - 0.01
-        fits.append(fits[-1] & chunk.joined[last] & chunk.known[place] & behind & (aside <= 1e-12 * length))
+        fits.append(fits[-1] & chunk.known[place] & behind & (aside <= STRAIGHT * length))
         places.append(place)
         s.append(along)
     where = jnp.stack(places)

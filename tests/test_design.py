@@ -151,6 +151,7 @@ def many():
     return jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounds", [(0.3, 1.0), (0.3, 3.0)])
 def test_least_effort(many, bounds):
     """Where no bound holds, the contraction is along the slope of the angle: Lagrange's condition."""
@@ -238,7 +239,11 @@ def bounded(beam):
 
 
 @pytest.mark.parametrize(
-    ("optimiser", "steps", "most"), [(optax.adam(0.1), 400, 350), (optax.lbfgs(), 60, 30)], ids=["adam", "lbfgs"]
+    ("optimiser", "steps", "most"),
+    [
+        pytest.param(optax.adam(0.1), 400, 350, id="adam"),
+        pytest.param(optax.lbfgs(), 60, 30, id="lbfgs", marks=pytest.mark.slow),
+    ],
 )
 def test_optax_reaches_the_angle(beam, optimiser, steps, most):
     """To 1e-6 degrees, with Adam and with L-BFGS and its line search."""

@@ -38,6 +38,15 @@ def test_neighbours_save_steps(small):
     np.testing.assert_allclose(found.ratios, LINE, rtol=1e-15)
 
 
+def test_close_neighbours_leave_no_step(small):
+    """A fine line of commands: once a branch is begun its polynomial is exact to the tolerance, whatever the spacing."""
+    d = np.linspace(0, 0.2, 101)
+    found = jb.check(jb.sweep(small, np.stack([1 + d, 1 - d], axis=1)))
+    steps = np.asarray(found.steps)
+    assert steps[10:].sum() <= 2 and steps.sum() < 12
+    assert (np.asarray(found.residual) <= found.tolerance).all()
+
+
 def test_chunks_change_nothing_but_the_work(small, chunks_of_five):
     seen = []
     whole = jb.sweep(small, LINE, progress=lambda done, total: seen.append((done, total)))
