@@ -124,7 +124,7 @@ def unlock(tree: T) -> T:
     new = object.__new__(type(tree))
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
-        if field.metadata.get("kind") == "index":
+        if field.metadata.get("kind") == "index" and value is not None:
             # Once an owner: a scene is commanded and solved again and again.
             slot = "_device_" + field.name
             if slot not in tree.__dict__:

@@ -1,4 +1,4 @@
-"""Linear algebra of Newton's method: projection, assembly and symmetric positive definite factorisation.
+"""Linear algebra of Newton's method: assembly and symmetric positive definite factorisation.
 
 A linear solver is a value with three methods, `layout`, `factor` and `solve`. `Dense` and
 `BlockTridiagonal` share the assembly and differ in where an entry of the matrix is stored.
@@ -27,22 +27,6 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Key, pytree, static_field, to_device
-
-
-def project_semidefinite(hessians: jax.Array) -> jax.Array:
-    """Nearest positive semidefinite matrices in the Frobenius norm (Higham 1988): negative eigenvalues to 0.
-
-    Args:
-        hessians: symmetric `(m, s, s)`.
-    """
-
-    def one(hessian: jax.Array) -> jax.Array:
-        values, vectors = jnp.linalg.eigh(hessian)
-        return (vectors * jnp.maximum(values, 0)) @ vectors.T
-
-    # One by one. A batched eigh shares XLA's threads out among its matrices and waits for them: two programs that run
-    # side by side, as in a sweep, then wait for each other for ever (jaxlib 0.10 on a processor of two cores).
-    return lax.map(one, hessians)
 
 
 @pytree

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbeam.scene import Scene, solid_terms, tendon_terms
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
-from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, displacement_gradients, polyline_length
+from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, displacement_gradients
 
 
 def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
@@ -61,17 +61,12 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
 
 def tendon_lengths(scene: Scene, x: jax.Array) -> jax.Array:
     """Present length of each tendon, `(m,)`."""
-    found = [jax.vmap(polyline_length)(x[t.nodes]) for t in tendon_terms(scene)]
-    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
+    return _over_tendons(scene, x, lambda energy: energy.length)
 
 
 def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `dE/dl = k (l - l*)` of each tendon, `(m,)`; positive when it pulls its ends together."""
-    found = []
-    for term in tendon_terms(scene):
-        assert isinstance(term.energy, TendonEnergy)
-        found.append(jax.vmap(term.energy.tension)(x[term.nodes], term.params))
-    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
+    return _over_tendons(scene, x, lambda energy: energy.tension)
 
 
 def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
@@ -114,6 +109,15 @@ def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]
     if not found:
         raise ValueError("scene: expected a solid term, got none; stress and J are measured on solids")
     return jnp.concatenate(found)
+
+
+def _over_tendons(scene: Scene, x: jax.Array, measure: Callable[[TendonEnergy], Callable[..., jax.Array]]) -> jax.Array:
+    """A measure of each tendon, `(m,)`."""
+    found = []
+    for term in tendon_terms(scene):
+        assert isinstance(term.energy, TendonEnergy)
+        found.append(jax.vmap(measure(term.energy))(x[term.nodes], term.params))
+    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
 
 
 def _tip(scene: Scene) -> np.ndarray:

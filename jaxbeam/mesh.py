@@ -1,6 +1,7 @@
 """Triangle meshes: rest positions of the nodes and the triangles that join them.
 
-Triangles are counter-clockwise, lengths are in the user's unit. Everything is checked here, on the host,
+Triangles have three nodes (P1) or six (P2, see `jaxbeam.elements` for their order) and are counter-clockwise, lengths
+are in the user's unit. Everything is checked here, on the host,
 once; what follows trusts a `Mesh`.
 """
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, to_device
+from jaxbeam.elements import EDGES, shape_functions, shape_slopes
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
 
@@ -25,11 +27,12 @@ class Mesh:
     Args:
         nodes: `(n, 2)` rest positions, in the user's length unit. Their dtype is the dtype of every
             computation on the mesh. May be traced: shape is differentiable.
-        elements: `(t, 3)` node numbers of each triangle, counter-clockwise. Always concrete.
+        elements: `(t, 3)` or `(t, 6)` node numbers of each triangle: its corners, counter-clockwise, and then the
+            nodes between corners 0 and 1, 1 and 2, 2 and 0. Always concrete.
 
     Raises:
         ValueError: if a shape or dtype is wrong, an index is out of range, a triangle repeats a node, is
-            listed twice or has an area that is not positive, a node is unused, two nodes coincide, or a
+            listed twice, is inverted somewhere or has no area, a node is unused, two nodes coincide, or a
             coordinate is not finite. Checks on positions are skipped while `nodes` is traced.
     """
 
@@ -61,29 +64,34 @@ def rectangle(
     ny: int,
     diagonals: Diagonals = "one-sided",
     dtype: Any = None,
+    *,
+    order: int = 1,
 ) -> Mesh:
-    """Mesh of a rectangle centred on the origin, of `nx` x `ny` nodes.
+    """Mesh of a rectangle centred on the origin, whose triangles have `nx` x `ny` corners.
 
-    Node `(i, j)`, column `i` from the left and row `j` from below, has number `i * ny + j`; the cell
-    centres of crossed diagonals follow after all of these.
+    Corner `(i, j)`, column `i` from the left and row `j` from below, has number `i * ny + j`; the cell
+    centres of crossed diagonals follow after all of these, and then the nodes between corners, if `order` is 2.
 
     Args:
         length: extent in x, positive; may be traced.
         height: extent in y, positive; may be traced.
-        nx: nodes along the length, at least 2.
-        ny: nodes along the height, at least 2.
+        nx: corners along the length, at least 2.
+        ny: corners along the height, at least 2.
         diagonals: how a cell is split. `"one-sided"`: two triangles, by the diagonal from lower left to
             upper right. `"mirrored"`: the same below mid-height and its mirror image above, so the mesh is
             symmetric about mid-height (`ny` must be odd). `"crossed"`: four triangles about the centre.
         dtype: of the nodes; by default JAX's float.
+        order: of the shape functions: 1 for triangles of three nodes, 2 for six (see `quadratic`).
 
     Returns:
         A `Mesh`, differentiable in `length` and `height`.
 
     Raises:
         ValueError: if a count is not a whole number of at least 2, an extent is not positive and finite,
-            `diagonals` is unknown, or a mirrored mesh is asked for with an even `ny`.
+            `diagonals` or `order` is unknown, or a mirrored mesh is asked for with an even `ny`.
     """
+    if order not in (1, 2):
+        raise ValueError(f"order: expected 1 (triangles of three nodes) or 2 (of six), got {order!r}")
     for name, count in (("nx", nx), ("ny", ny)):
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 2:
             raise ValueError(f"{name}: expected a whole number of at least 2, got {count!r}")
@@ -118,7 +126,76 @@ def rectangle(
         dtype = jnp.result_type(float)
     xp = namespace(length, height)
     extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
-    return Mesh(xp.asarray(unit, dtype) * extent, elements)
+    mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
+    return quadratic(mesh) if order == 2 else mesh
+
+
+def quadratic(mesh: Mesh) -> Mesh:
+    """The mesh of the same triangles with six nodes each: those between corners follow after the corners.
+
+    Differentiable in the nodes.
+
+    Raises:
+        ValueError: if the triangles have six nodes already.
+    """
+    if mesh.elements.shape[1] != 3:
+        raise ValueError("mesh: its triangles have six nodes already")
+    ends, between = _edges(mesh.elements)
+    nodes = namespace(mesh.nodes).asarray(mesh.nodes)
+    xp = namespace(nodes)
+    middles = (nodes[ends[:, 0]] + nodes[ends[:, 1]]) / 2
+    elements = np.concatenate([mesh.elements, len(nodes) + between], axis=1)
+    return Mesh(xp.concatenate([nodes, middles]), elements)
+
+
+def refined(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh with every triangle cut into four by the middles of its edges, and which triangle each comes from.
+
+    Nodes keep their numbers. Six-node triangles keep the shape of their edges: the new nodes lie where the shape
+    functions put them. Differentiable in the nodes.
+    """
+    k = mesh.elements.shape[1]
+    corners = mesh.elements[:, :3]
+    parents = np.repeat(np.arange(len(corners)), 4)
+    nodes = namespace(mesh.nodes).asarray(mesh.nodes)
+    xp = namespace(nodes)
+    if k == 3:
+        fine = quadratic(mesh)
+        c, m = corners, fine.elements[:, 3:]
+        four = [(c[:, 0], m[:, 0], m[:, 2]), (m[:, 0], c[:, 1], m[:, 1]), (m[:, 2], m[:, 1], c[:, 2])]
+        four.append((m[:, 0], m[:, 1], m[:, 2]))
+        return Mesh(fine.nodes, np.stack([np.stack(f, axis=1) for f in four], axis=1).reshape(-1, 3)), parents
+    # The places, in the triangle, of the six nodes of each of its four parts; the first six are nodes already.
+    local = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+    parts = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+    places = np.stack([np.concatenate([local[p], [(local[p[a]] + local[p[b]]) / 2 for a, b in EDGES]]) for p in parts])
+    inside = places[:, 3:].reshape(12, 3)
+    # Parts share nodes with each other and with the neighbours: a node is known by its corner, weighted by place.
+    new = xp.einsum("pk,tkd->tpd", shape_functions(6, inside).astype(nodes.dtype), nodes[mesh.elements])
+    whole = np.round(4 * inside).astype(np.int64)
+    order = np.sort(np.where(whole[None] > 0, corners[:, None] * 4 + whole[None], -1), axis=2).reshape(-1, 3)
+    _, first, number = np.unique(order, axis=0, return_index=True, return_inverse=True)
+    number = (len(nodes) + number.reshape(-1)).reshape(len(corners), 4, 3)
+    elements = np.concatenate([mesh.elements[:, parts], number], axis=2).reshape(-1, 6)
+    return Mesh(xp.concatenate([nodes, new.reshape(-1, 2)[first]]), elements), parents
+
+
+def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
+    """Corner nodes, in the order given, and the nodes that lie between two of them."""
+    among = np.isin(mesh.elements[:, :3], corners)
+    found = (
+        [mesh.elements[among[:, a] & among[:, b], 3 + k] for k, (a, b) in enumerate(EDGES)]
+        if mesh.elements.shape[1] == 6
+        else []
+    )
+    return np.concatenate([corners, np.unique(np.concatenate([*found, np.zeros(0, int)]))]).astype(int)
+
+
+def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges `(e, 2)` of triangles `(t, 3)`, lower node first, and the number `(t, 3)` of each one's."""
+    pairs = np.sort(triangles[:, EDGES].reshape(-1, 2), axis=1)
+    ends, number = np.unique(pairs, axis=0, return_inverse=True)
+    return ends, number.reshape(-1, 3)
 
 
 def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
@@ -185,9 +262,9 @@ def _checked_elements(elements: Any) -> np.ndarray:
     array = np.asarray(elements)
     if array.dtype.kind not in "iu":
         raise ValueError(f"elements: expected whole numbers, got dtype {array.dtype}")
-    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+    if array.ndim != 2 or array.shape[1] not in (3, 6) or array.shape[0] == 0:
         raise ValueError(
-            f"elements: expected shape (t, 3) with t >= 1, got {array.shape}; give a row for each triangle"
+            f"elements: expected shape (t, 3) or (t, 6) with t >= 1, got {array.shape}; give a row for each triangle"
         )
     if array.max() >= 2**31:
         raise ValueError(f"elements: node numbers must fit 32 bits, got {array.max()}")
@@ -234,10 +311,15 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         )
     a, b, c = nodes[elements[:, 0]], nodes[elements[:, 1]], nodes[elements[:, 2]]
     area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    if elements.shape[1] == 6 and (area > 0).all():
+        # Where edges are curved the triangle must not fold over at any of its nodes.
+        slopes = shape_slopes(6, np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]]))
+        map_ = np.einsum("tkd,qki->tqdi", nodes[elements], slopes)
+        area = 0.5 * np.linalg.det(map_).min(axis=1)
     bad = np.flatnonzero(area <= 1e-14 * extent**2)
     if bad.size:
         k = bad[0]
-        cure = "list its nodes counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
+        cure = "list its corners counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
         raise ValueError(
             f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
             f" ({bad.size} such triangles)"

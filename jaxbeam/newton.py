@@ -23,7 +23,6 @@ from jax import lax
 from jaxbeam._tree import Key, blank, choose
 from jaxbeam.dissection import Automatic
 from jaxbeam.linear import Layout, LinearSolver, Topology, assemble, expand, gather
-from jaxbeam.linear import project_semidefinite as project
 from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
 
 
@@ -146,13 +145,12 @@ def newton(
     def body(state: State) -> State:
         bold = state.fresh | (state.definite & (state.counts[STEPS] < free))
         x, at, halvings, moved = line_search(scene, state, bold, solver)
-        hessians = stencil_hessians(scene, x)
-        storage = assemble(layout, hessians)
+        storage = assemble(layout, stencil_hessians(scene, x))
         unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, at.gradient)))
         residual = unbalanced / force_scale(layout, storage, x, at, rtol)
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
         rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
-        factor, definite, marginal = factorise(layout, hessians, storage, jnp.isfinite(residual), solver)
+        factor, definite, marginal = factorise(scene, layout, x, storage, jnp.isfinite(residual), solver)
         pulls = jnp.stack([at.gradient, probe(x, definite)])
         moves = solver.linear.solve(layout, factor, jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls))
         moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
@@ -206,7 +204,7 @@ def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation
 
 
 def factorise(
-    layout: Layout, hessians: list[jax.Array], storage: jax.Array, finite: jax.Array, solver: Newton
+    scene: Scene, layout: Layout, x: jax.Array, storage: jax.Array, finite: jax.Array, solver: Newton
 ) -> tuple[Any, jax.Array, jax.Array]:
     """A positive definite factor: of the true Hessian if it has one, else of one blended with the projected one.
 
@@ -221,9 +219,8 @@ def factorise(
     def project_all(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would be computed
         # in every Newton step, needed or not.
-        _, stencils = lax.optimization_barrier((carry, hessians))
-        convex = [jnp.moveaxis(project(jnp.moveaxis(h, -1, 0)), 0, -1) for h in stencils]
-        return assemble(layout, convex), jnp.zeros((), bool)
+        _, here = lax.optimization_barrier((carry, x))
+        return assemble(layout, stencil_hessians(scene, here, convex=True)), jnp.zeros((), bool)
 
     def attempt(carry: Any) -> Any:
         tries, _, _, convex = carry

@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxbeam.projection import project_each, project_many
 from jaxbeam.terms import SolidEnergy, SolidParams, Term
 
 
@@ -33,15 +34,22 @@ def stencil_gradients(term: Term, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.sum(weights * density, axis=0), jnp.moveaxis(jnp.sum(forces, axis=-2), -1, 0)
 
 
-def stencil_hessian(term: Term, x: jax.Array) -> jax.Array:
-    """Hessians `(2 k, 2 k, m)` of the stencils of a term at node positions `x` `(n, 2)`."""
+def stencil_hessian(term: Term, x: jax.Array, convex: bool = False) -> jax.Array:
+    """Hessians `(2 k, 2 k, m)` of the stencils of a term at node positions `x` `(n, 2)`.
+
+    With `convex`, positive semidefinite ones near them (see `jaxbeam.projection`).
+    """
     positions = x[term.nodes]
     m, k, d = positions.shape
     if not isinstance(term.energy, SolidEnergy):
         of_one = lambda flat, params: term.energy(flat.reshape(k, d), params)
-        return jax.vmap(jax.hessian(of_one), out_axes=-1)(positions.reshape(m, k * d), term.params)
+        hessians = jax.vmap(jax.hessian(of_one))(positions.reshape(m, k * d), term.params)
+        return jnp.moveaxis(project_each(hessians) if convex else hessians, 0, -1)
     gradients, weights, stiffness = _at_points(_stiffness, term.energy, positions, term.params)
-    second = weights * jnp.stack(stiffness).reshape(2, 2, 2, 2, *weights.shape)
+    second = jnp.stack(stiffness)
+    if convex:
+        second = project_many(second.reshape(4, 4, -1))
+    second = weights * second.reshape(2, 2, 2, 2, *weights.shape)
     # (a, i, j, l) and then (a, i, b, j); the last two axes are the points and the elements.
     left, right = gradients[:, :, None, None, None], gradients[None, None, :, None]
     half = left[:, 0] * second[None, :, 0] + left[:, 1] * second[None, :, 1]

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, static_field, to_device
+from jaxbeam.anchors import patch
+from jaxbeam.elements import rule, shape_slopes
 from jaxbeam.materials import macklin_mueller
 from jaxbeam.mesh import Mesh
 
@@ -129,17 +131,21 @@ def solid(
     mesh: Mesh,
     params: Any,
     density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    degree: int | None = None,
 ) -> Term:
-    """The body itself: linear triangles (one quadrature point, exact for a constant gradient).
+    """The body itself.
 
     Args:
         mesh: with nodes `(n, 2)`; differentiable in them.
         params: the density's parameters, such as `lame(young, poisson)`: a pytree whose leaves are scalars
             or have leading axis `t`, one entry for each triangle. Cast to the dtype of the nodes.
         density: `(H, params) -> scalar`, one of `jaxbeam.materials` or your own module-level function.
+        degree: of the polynomials in the density that the quadrature takes exactly, of `jaxbeam.elements.DEGREES`. By
+            default 1 (one point) for triangles of three nodes, where that is exact for any density, and 2 (three
+            points) for six.
 
     Raises:
-        ValueError: if a parameter is neither a scalar nor of leading axis `t`.
+        ValueError: if a parameter is neither a scalar nor of leading axis `t`, or there is no rule of that degree.
     """
     count, dtype = mesh.elements.shape[0], mesh.nodes.dtype
     xp = namespace(mesh.nodes, *jax.tree.leaves(params))
@@ -157,13 +163,16 @@ def solid(
 
     material = jax.tree_util.tree_map_with_path(per_element, params)
     rest = xp.asarray(mesh.nodes)[mesh.elements]
-    first, second = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
-    twice_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # Gradients of the barycentric coordinates: rows of the inverse of the edge matrix, and minus their sum.
-    g1 = xp.stack([second[:, 1], -second[:, 0]], axis=1) / twice_area[:, None]
-    g2 = xp.stack([-first[:, 1], first[:, 0]], axis=1) / twice_area[:, None]
-    gradients = xp.stack([-(g1 + g2), g1, g2], axis=1)[:, None]
-    return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, 0.5 * twice_area[:, None], material))
+    points, shares = rule((1 if rest.shape[1] == 3 else 2) if degree is None else degree)
+    # How a triangle is mapped from the reference one, and the inverse of that, at each point.
+    slopes = xp.asarray(shape_slopes(rest.shape[1], points), dtype)
+    map_ = xp.einsum("mkd,qki->mqdi", rest, slopes)
+    determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
+    inverse = xp.stack([map_[..., 1, 1], -map_[..., 0, 1], -map_[..., 1, 0], map_[..., 0, 0]], axis=-1)
+    inverse = inverse.reshape(map_.shape) / determinant[..., None, None]
+    gradients = xp.einsum("qki,mqid->mqkd", slopes, inverse)
+    weights = 0.5 * xp.asarray(shares, dtype) * determinant
+    return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, weights, material))
 
 
 # -------------------------------------------------------------------------------------------- tendons
@@ -171,15 +180,20 @@ def solid(
 
 @pytree
 class TendonParams:
-    """Parameters of tendons (leading axis `m` in a `Term`), all differentiable.
+    """Parameters of tendons (leading axis `m` in a `Term`), all differentiable but the last two.
 
     natural: length at rest (ratio 1). commanded: rest length asked for now, `ratio * natural`.
     modulus: the coefficient of the tendon's stiffness law.
+    attachment: what the energy's `points` needs to know; none for tendons fixed to nodes.
+    ends, width `(m, k)`: the node and the width of each anchor, if there are any of finite width.
     """
 
     natural: jax.Array
     commanded: jax.Array
     modulus: jax.Array
+    attachment: Any = None
+    width: Any = None
+    ends: Any = index_field(default=None)
 
 
 def inverse_square_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
@@ -197,20 +211,35 @@ def constant_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
     return modulus
 
 
+def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
+    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes."""
+    return x
+
+
+def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
+    """The points `(p, 2)` of a tendon that are weighted means, by weights `(p, k)`, of its `k` nodes."""
+    return jnp.sum(attachment[:, :, None] * x, axis=1)
+
+
 @dataclasses.dataclass(frozen=True)
 class TendonEnergy:
-    """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its nodes, `l*` the
+    """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its points, `l*` the
     commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes."""
 
     stiffness: Callable[[jax.Array, jax.Array], jax.Array]
+    points: Callable[[jax.Array, Any], jax.Array] = at_nodes
 
     def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        stretch = polyline_length(x) - params.commanded
+        stretch = self.length(x, params) - params.commanded
         return 0.5 * self.stiffness(params.modulus, params.commanded) * stretch**2
+
+    def length(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        """Present length `l`."""
+        return polyline_length(self.points(x, params.attachment))
 
     def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
         """`dE/dl = k (l - l*)`, positive when it pulls."""
-        return self.stiffness(params.modulus, params.commanded) * (polyline_length(x) - params.commanded)
+        return self.stiffness(params.modulus, params.commanded) * (self.length(x, params) - params.commanded)
 
 
 def polyline_length(x: jax.Array) -> jax.Array:
@@ -229,6 +258,7 @@ def tendons(
     nodes: Numbers,
     modulus: Numbers,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    width: Numbers = 0.0,
 ) -> Term:
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
 
@@ -239,10 +269,12 @@ def tendons(
         stiffness: the law `(modulus, commanded) -> k`, such as `inverse_square_stiffness` (of the reference
             scene; unit of modulus: force x length), `inverse_stiffness` (force) or `constant_stiffness`
             (force / length). Tendons of another law are another term.
+        width: of the patch of surface that each node stands for (see `jaxbeam.anchors`), scalar or `(m, k)`. At 0 the
+            tendon pulls on the node alone: a point load, whose answer has no limit as the mesh is refined.
 
     Raises:
         ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
-            nodes, or a concrete modulus is not positive and finite.
+            nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
     """
     lines = check_nodes("nodes", mesh, nodes, ndim=2)
     if lines.shape[1] < 2:
@@ -257,10 +289,37 @@ def tendons(
             raise ValueError(f"modulus: expected positive finite numbers, got {modulus!r}")
     if np.shape(modulus) not in ((), (lines.shape[0],)):
         raise ValueError(f"modulus: expected a scalar or {lines.shape[0]} entries, got shape {np.shape(modulus)}")
-    natural = polyline_length(namespace(mesh.nodes).asarray(mesh.nodes)[lines])
+    widths = np.broadcast_to(np.asarray(width, float), lines.shape) if np.shape(width) in ((), lines.shape) else None
+    if widths is None or not (np.isfinite(widths) & (widths >= 0)).all():
+        raise ValueError(f"width: expected numbers of at least 0, a scalar or shape {lines.shape}, got {width!r}")
+    dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
+    if not widths.any():
+        nodes_of, energy, anchored = lines, TendonEnergy(stiffness), ()
+        natural = polyline_length(rest[lines])
+    else:
+        nodes_of, weights = _means(mesh, lines, widths)
+        energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
+        natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, np.asarray(rest)[nodes_of]).astype(dtype))
     xp = namespace(modulus)
-    moduli = xp.broadcast_to(xp.asarray(modulus, mesh.nodes.dtype), natural.shape)
-    return Term(TendonEnergy(stiffness), lines, TendonParams(natural, natural, moduli))
+    moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
+    return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
+
+
+def _means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes `(m, k)` of the patches of each tendon, and the weights `(m, p, k)` of its `p` points."""
+    found = [
+        [patch(mesh, int(node), float(width)) for node, width in zip(*pair, strict=True)]
+        for pair in zip(lines, widths, strict=True)
+    ]
+    unions = [np.unique(np.concatenate([nodes for nodes, _ in line])) for line in found]
+    most = max(len(union) for union in unions)
+    # Filled up with the last node, at weight 0.
+    nodes = np.stack([np.append(union, np.full(most - len(union), union[-1])) for union in unions])
+    weights = np.zeros((*lines.shape, most))
+    for k, line in enumerate(found):
+        for p, (members, values) in enumerate(line):
+            weights[k, p, np.searchsorted(unions[k], members)] = values
+    return nodes, weights
 
 
 # ---------------------------------------------------------------------------------- loads and springs

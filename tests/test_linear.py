@@ -22,20 +22,26 @@ from helpers import (
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
-from jaxbeam.linear import Topology, assemble, expand, gather, project_semidefinite
+from jaxbeam.linear import Topology, assemble, expand, gather
 from jaxbeam.newton import topology
+from jaxbeam.projection import project_each, project_many
 from jaxbeam.scene import stencil_hessians
 
 # ----------------------------------------------------------------------------------------- projection
 
 
-@pytest.fixture(scope="module")
-def projected():
-    """Random symmetric 6 x 6 matrices of mixed sign and size, and their projections."""
+def project_together(matrices):
+    return jnp.moveaxis(project_many(jnp.moveaxis(matrices, 0, -1)), -1, 0)
+
+
+@pytest.fixture(scope="module", params=[(project_each, 6), (project_together, 4), (project_together, 6)])
+def projected(request):
+    """A projection, random symmetric matrices of mixed sign and size, and what it makes of them."""
+    project, s = request.param
     rng = np.random.default_rng(0)
-    matrices = rng.normal(size=(12, 6, 6)) * np.geomspace(1e-3, 1e3, 12)[:, None, None]
+    matrices = rng.normal(size=(12, s, s)) * np.geomspace(1e-3, 1e3, 12)[:, None, None]
     matrices = matrices + np.swapaxes(matrices, 1, 2)
-    return matrices, np.asarray(project_semidefinite(jnp.asarray(matrices)))
+    return project, matrices, np.asarray(project(jnp.asarray(matrices)))
 
 
 def norms(matrices):
@@ -43,7 +49,7 @@ def norms(matrices):
 
 
 def test_projection_is_semidefinite(projected):
-    matrices, nearest = projected
+    _, matrices, nearest = projected
     assert (np.linalg.eigvalsh(matrices)[:, 0] < 0).all()
     # LAPACK's eigenvalues are right to a few eps of the norm.
     assert (np.linalg.eigvalsh(nearest)[:, 0] > -100 * EPS * norms(matrices)).all()
@@ -52,7 +58,7 @@ def test_projection_is_semidefinite(projected):
 
 def test_projection_is_the_nearest(projected):
     """Three ways: the distance of Higham (1988), the inequality that marks the nearest point, brute force."""
-    matrices, nearest = projected
+    _, matrices, nearest = projected
     negative = np.minimum(np.linalg.eigvalsh(matrices), 0)
     np.testing.assert_allclose(norms(matrices - nearest), np.sqrt(np.sum(negative**2, axis=1)), rtol=1e-12)
     rng = np.random.default_rng(1)
@@ -60,7 +66,7 @@ def test_projection_is_the_nearest(projected):
         distance, size = np.linalg.norm(matrix - point), np.linalg.norm(matrix)
         for scale in np.geomspace(1e-4, 1, 200):
             # A random semidefinite matrix, from far away to beside the projection; of any rank.
-            root = rng.normal(size=(6, rng.integers(1, 7)))
+            root = rng.normal(size=(len(point), rng.integers(1, 7)))
             other = (1 - scale) * point + scale * size * (root @ root.T) / np.linalg.norm(root) ** 2
             assert np.linalg.norm(matrix - other) >= distance * (1 - 1e-12)
             # The nearest point of a convex set: no other point lies on the matrix's side of it.
@@ -68,13 +74,13 @@ def test_projection_is_the_nearest(projected):
 
 
 def test_projection_is_idempotent_and_leaves_definite_alone(projected):
-    matrices, nearest = projected
-    again = project_semidefinite(jnp.asarray(nearest))
+    project, matrices, nearest = projected
+    again = project(jnp.asarray(nearest))
     np.testing.assert_allclose(norms(again - nearest) / norms(matrices), 0, atol=100 * EPS)
-    definite = nearest + 0.1 * norms(matrices)[:, None, None] * np.eye(6)
-    same = project_semidefinite(jnp.asarray(definite))
+    definite = nearest + 0.1 * norms(matrices)[:, None, None] * np.eye(nearest.shape[1])
+    same = project(jnp.asarray(definite))
     np.testing.assert_allclose(norms(same - definite) / norms(definite), 0, atol=100 * EPS)
-    opposite = np.asarray(project_semidefinite(jnp.asarray(-definite)))
+    opposite = np.asarray(project(jnp.asarray(-definite)))
     np.testing.assert_allclose(norms(opposite) / norms(definite), 0, atol=100 * EPS)
 
 

@@ -39,7 +39,7 @@ def test_neighbours_save_steps(small):
 
 
 def test_close_neighbours_leave_no_step(small):
-    """A fine line of commands: once a branch is begun its polynomial is exact to the tolerance, whatever the spacing."""
+    """A fine line of commands: once a branch is begun its polynomial is exact to the tolerance."""
     d = np.linspace(0, 0.2, 101)
     found = jb.check(jb.sweep(small, np.stack([1 + d, 1 - d], axis=1)))
     steps = np.asarray(found.steps)

@@ -1,0 +1,77 @@
+"""Where a tendon is attached to a body: at a node, or over a patch of the surface.
+
+A force on one node is a point load, under which the displacement of a continuum is infinite: the answer drifts without
+end as the mesh is refined. A patch of finite width has a limit. Its position is the mean of the surface, weighted by a
+tent of the arc length `s` from the anchor,
+
+    p = int w(s) x(s) ds / int w(s) ds,     w = max(0, 1 - |s| / width),
+
+with `x(s)` as the shape functions have it, so that it is a weighted mean of nodes whose weights add up to 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxbeam._tree import is_concrete
+from jaxbeam.elements import EDGES
+from jaxbeam.mesh import Mesh
+
+# Gauss's rule of two points on (0, 1): exact for a shape function times the tent.
+_POINTS = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
+
+
+def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes `(k,)` of the surface within `width` of a corner node of it, the node itself first, and weights `(k,)`.
+
+    Arc length is measured along edges taken as straight, round corners of the body too. With a width of 0 it is the
+    node alone.
+
+    Raises:
+        ValueError: if the nodes are traced, the node is not a corner of a triangle on the surface, or the surface
+            within `width` closes on itself.
+    """
+    if width == 0:
+        return np.array([node]), np.ones(1)
+    if not is_concrete(mesh.nodes):
+        raise ValueError("width: an anchor of finite width needs concrete nodes; build the mesh outside jit and grad")
+    positions = np.asarray(mesh.nodes, float)
+    edges = surface(mesh)
+    weights = {node: 0.0}
+    for edge_of, flip in (
+        ({edge[0]: edge for edge in edges.tolist()}, False),
+        ({edge[1]: edge for edge in edges.tolist()}, True),
+    ):
+        here, s = node, 0.0
+        while s < width:
+            if here not in edge_of or (s > 0 and here == node):
+                problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
+                raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
+            first, second, *middle = edge_of[here]
+            line = [second, first, *middle] if flip else [first, second, *middle]
+            length = float(np.linalg.norm(positions[second] - positions[first]))
+            share = min(1.0, (width - s) / length)
+            xi = share * _POINTS
+            tent = 0.5 * share * length * (1 - (s + length * xi) / width)
+            for number, values in zip(line, _line_functions(len(line), xi), strict=True):
+                weights[number] = weights.get(number, 0.0) + float(tent @ values)
+            here, s = line[1], s + length
+    nodes, values = np.array(list(weights)), np.array(list(weights.values()))
+    return nodes, values / values.sum()
+
+
+def surface(mesh: Mesh) -> np.ndarray:
+    """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
+    body, and the node between them if there is one."""
+    triangles = mesh.elements
+    sides = [[triangles[:, a], triangles[:, b], *triangles.T[3 + k :][:1]] for k, (a, b) in enumerate(EDGES)]
+    every = np.stack([np.stack(side, axis=1) for side in sides], axis=1).reshape(-1, 2 + (triangles.shape[1] == 6))
+    _, number, count = np.unique(np.sort(every[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True)
+    return every[count[number.ravel()] == 1]
+
+
+def _line_functions(nodes: int, xi: np.ndarray) -> list[np.ndarray]:
+    """The shape functions of an edge, at `xi` from its first corner (0) to its second (1)."""
+    if nodes == 2:
+        return [1 - xi, xi]
+    return [(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)]
