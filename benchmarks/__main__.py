@@ -17,7 +17,7 @@ from pathlib import Path
 # In the order of what they take: minutes each, an hour for `extremes`, which is run by name.
 NAMES = ("single", "many", "floor", "scaling", "sparse", "simkit_peer")
 # These print alone.
-PRINTING = ("gradient", "precision")
+PRINTING = ("gradient", "precision", "verification")
 BY_NAME = ("extremes",)
 
 

@@ -1,9 +1,15 @@
 """jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
 
-Read it in order: mesh -> materials -> terms -> scene -> equilibrium -> actuation -> sweep -> measures -> design.
+Read it in order: elements -> mesh -> materials -> terms -> scene -> equilibrium -> actuation -> sweep -> measures ->
+design -> accuracy.
 Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib.
 """
 
+from jaxbeam.accuracy import Answer as Answer
+from jaxbeam.accuracy import ErrorEstimate as ErrorEstimate
+from jaxbeam.accuracy import enriched as enriched
+from jaxbeam.accuracy import estimate_error as estimate_error
+from jaxbeam.accuracy import solve_to as solve_to
 from jaxbeam.actuation import commands as commands
 from jaxbeam.actuation import ramp as ramp
 from jaxbeam.branch import Branch as Branch
@@ -18,6 +24,7 @@ from jaxbeam.design import reach_each as reach_each
 from jaxbeam.dissection import Automatic as Automatic
 from jaxbeam.dissection import NestedDissection as NestedDissection
 from jaxbeam.equilibrium import equilibrium as equilibrium
+from jaxbeam.equilibrium import linear_response as linear_response
 from jaxbeam.linear import BlockTridiagonal as BlockTridiagonal
 from jaxbeam.linear import Dense as Dense
 from jaxbeam.materials import Lame as Lame
@@ -29,6 +36,7 @@ from jaxbeam.materials import neo_hookean as neo_hookean
 from jaxbeam.materials import saint_venant_kirchhoff as saint_venant_kirchhoff
 from jaxbeam.measures import cauchy_stress as cauchy_stress
 from jaxbeam.measures import jacobians as jacobians
+from jaxbeam.measures import nodal_stress as nodal_stress
 from jaxbeam.measures import section_rotation as section_rotation
 from jaxbeam.measures import strain_energy as strain_energy
 from jaxbeam.measures import tendon_lengths as tendon_lengths
@@ -38,14 +46,18 @@ from jaxbeam.measures import tip_position as tip_position
 from jaxbeam.mesh import Mesh as Mesh
 from jaxbeam.mesh import nearest_node as nearest_node
 from jaxbeam.mesh import nodes_where as nodes_where
+from jaxbeam.mesh import quadratic as quadratic
 from jaxbeam.mesh import rectangle as rectangle
+from jaxbeam.mesh import refined as refined
 from jaxbeam.newton import Newton as Newton
+from jaxbeam.rod import euler_bernoulli as euler_bernoulli
 from jaxbeam.scene import Scene as Scene
 from jaxbeam.scene import clamped as clamped
 from jaxbeam.scene import command as command
 from jaxbeam.scene import energy as energy
 from jaxbeam.scene import forces as forces
 from jaxbeam.scene import reactions as reactions
+from jaxbeam.scene import rod_beam as rod_beam
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
 from jaxbeam.scene import tendon_beam as tendon_beam
 from jaxbeam.solution import EquilibriumError as EquilibriumError

@@ -43,7 +43,7 @@ def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
         ({edge[1]: edge for edge in edges.tolist()}, True),
     ):
         here, s = node, 0.0
-        while s < width:
+        while s < (1 - 1e-9) * width:
             if here not in edge_of or (s > 0 and here == node):
                 problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
                 raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")

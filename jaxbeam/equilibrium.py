@@ -16,13 +16,24 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock
+from jaxbeam.dissection import Automatic
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
 from jaxbeam.implicit import follow_scene
-from jaxbeam.linear import Layout
+from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.newton import Newton, topology
 from jaxbeam.predictor import begin
-from jaxbeam.scene import Scene, command, energy, partway, ratios_of, smallest_jacobian, worst_element
+from jaxbeam.scene import (
+    Scene,
+    command,
+    energy,
+    evaluate,
+    partway,
+    ratios_of,
+    smallest_jacobian,
+    stencil_hessians,
+    worst_element,
+)
 from jaxbeam.solution import Solution
 
 
@@ -55,6 +66,29 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
         return _equilibrium(open_scene, layout, x, solver)[0]
     solution, factor = _equilibrium(*lax.stop_gradient((open_scene, layout, x)), solver)
     return differentiable(open_scene, layout, solution, factor, solver)
+
+
+def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Array:
+    """Node positions `(n, 2)` by linear elasticity: the solution of one linear system, no more.
+
+    The energy is expanded to second order about rest, tendons and all, so displacements are in proportion to small
+    commands and loads. It is cheap and exact for those, and there is nothing in it that tells how wrong it is for
+    larger ones: on the reference scene it bends too little by 7 % at a ratio of 0.95 and by a quarter at 0.8, where the
+    hand calculation (`euler_bernoulli`) is right to 0.3 %.
+
+    Raises:
+        ValueError: if a piece of the mesh is not held.
+    """
+    check_held(scene)
+    return _linear_response(unlock(scene), linear.layout(topology(scene)), linear)
+
+
+@compiled("linear")
+def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> jax.Array:
+    rest = scene.mesh.nodes
+    factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
+    step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
+    return rest - expand(layout, step, rest.shape)
 
 
 @compiled("solver")

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbeam._tree import Key, is_concrete, replace
 from jaxbeam.mesh import pieces
+from jaxbeam.rod import Line, RodEnergy
 from jaxbeam.scene import Scene, stencil_hessians
 from jaxbeam.terms import SolidEnergy
 
@@ -19,7 +20,7 @@ from jaxbeam.terms import SolidEnergy
 def check_held(scene: Scene) -> None:
     """Refuse a scene in which a piece of the mesh moves rigidly, against no clamp and no spring.
 
-    Its tangent stiffness would be singular at rest. The solid itself never resists a rigid motion, so only
+    Its tangent stiffness would be singular at rest. A solid or a rod itself never resists a rigid motion, so only
     the other terms are asked, and only if clamped nodes alone do not hold every piece.
 
     Raises:
@@ -27,22 +28,25 @@ def check_held(scene: Scene) -> None:
     """
     if not is_concrete(*jax.tree.leaves(scene)) or _clamps_suffice(Key(scene.mesh.elements), Key(scene.fixed)):
         return
-    rest, piece = np.asarray(scene.mesh.nodes, float), pieces(scene.mesh.elements, scene.mesh.nodes.shape[0])
+    whole, piece = np.asarray(scene.mesh.nodes, float), pieces(scene.mesh.elements, scene.mesh.nodes.shape[0])
+    rest = whole[:, :2]
     count = int(piece.max()) + 1
     size = float(np.ptp(rest, axis=0).max())
     centres = [rest[piece == k].mean(axis=0) for k in range(count)]
-    motions = np.zeros((*rest.shape, count, 3))
+    motions = np.zeros((*whole.shape, count, 3))
     for k, centre in enumerate(centres):
         own = piece == k
         motions[own, 0, k, 0] = motions[own, 1, k, 1] = 1
-        motions[own, :, k, 2] = (rest[own] - centre)[:, ::-1] * [-1, 1] / size
-    motions = motions.reshape(rest.size, 3 * count)
+        motions[own, :2, k, 2] = (rest[own] - centre)[:, ::-1] * [-1, 1] / size
+        if isinstance(scene.mesh, Line):
+            motions[own, 2, k, 2] = float(scene.mesh.radian) / size
+    motions = motions.reshape(whole.size, 3 * count)
     _, values, basis = np.linalg.svd(motions[scene.fixed.ravel()], full_matrices=True)
     free = basis[np.sum(values > 1e-9) :].T
-    others = tuple(term for term in scene.terms if not isinstance(term.energy, SolidEnergy))
+    others = tuple(term for term in scene.terms if not isinstance(term.energy, SolidEnergy | RodEnergy))
     if free.shape[1] and others:
         resistance = np.zeros((free.shape[1], free.shape[1]))
-        moved = (motions @ free).reshape(*rest.shape, -1)
+        moved = (motions @ free).reshape(*whole.shape, -1)
         for term, hessians in zip(
             others, stencil_hessians(replace(scene, terms=others), scene.mesh.nodes), strict=True
         ):
@@ -63,9 +67,10 @@ def check_held(scene: Scene) -> None:
 
 @lru_cache(maxsize=32)
 def _clamps_suffice(elements: Key, fixed: Key) -> bool:
-    """Whether each piece of the mesh has two clamped nodes, which hold it wherever they are."""
+    """Whether each piece of the mesh has as many clamped nodes as hold it wherever they are: two, or one of a rod."""
     piece = pieces(elements.array, fixed.array.shape[0])
-    return bool((np.bincount(piece, fixed.array.all(axis=1)) >= 2).all())
+    enough = 2 if fixed.array.shape[1] == 2 else 1
+    return bool((np.bincount(piece, fixed.array.all(axis=1)) >= enough).all())
 
 
 def _name_motions(motions: np.ndarray, centre: np.ndarray, size: float) -> str:

@@ -1,6 +1,6 @@
 """What is measured on a beam: angles, positions, lengths, tensions, stresses, energies.
 
-Each takes the scene and node positions `x` `(n, 2)`, is pure, and is differentiable in both.
+Each takes the scene and node positions `x` `(n, 2)`, of a rod `(n, 3)`, is pure, and is differentiable in both.
 Angles are in degrees, everything else in the user's units.
 """
 
@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.elements import DEGREES, EDGES, rule
+from jaxbeam.rod import Line, RodEnergy
 from jaxbeam.scene import Scene, solid_terms, tendon_terms
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
-from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, displacement_gradients
+from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, Term, displacement_gradients
 
 
 def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
@@ -39,18 +41,21 @@ def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     Raises:
         ValueError: if the scene has no tip.
     """
-    return jnp.mean(x[_tip(scene)], axis=0)
+    return jnp.mean(x[_tip(scene)][:, :2], axis=0)
 
 
 def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     """Rotation of the tip section `()` in degrees, anticlockwise: the rigid turn that fits it best.
 
-    Least squares in the plane (Kabsch 1976): `atan2(sum X x y, sum X . y)` about the centroids.
+    Least squares in the plane (Kabsch 1976): `atan2(sum X x y, sum X . y)` about the centroids. Of a rod it is the
+    mean turn of the tip's nodes, which may be more than one round.
 
     Raises:
-        ValueError: if the scene has fewer than two tip nodes.
+        ValueError: if the scene has no tip, or a solid fewer than two tip nodes.
     """
     tip = _tip(scene)
+    if isinstance(scene.mesh, Line):
+        return jnp.rad2deg(jnp.mean((x - scene.mesh.nodes)[tip, 2]) / scene.mesh.radian)
     if tip.shape[0] < 2:
         raise ValueError(f"scene: expected at least two tip nodes to measure a rotation, got {tip.shape[0]}")
     before, after = scene.mesh.nodes[tip], x[tip]
@@ -78,9 +83,31 @@ def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     return _over_elements(scene, x, _stress)
 
 
+def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
+    """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
+
+    In each element the linear field that fits the stress at the quadrature points best, by least squares with their
+    weights, is carried to the nodes; at a node the elements that meet there are averaged, weighted by area at rest
+    (local smoothing: Hinton and Campbell 1974, Int. J. Numer. Methods Eng. 8, 461-480). Where two materials meet the
+    stress jumps, and this is a mean of both sides; at a node that no solid reaches it is zero.
+
+    Raises:
+        ValueError: if the scene has no solid, or a solid has quadrature points of a rule that is not in
+            `jaxbeam.elements`.
+    """
+    total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
+    for term, stress in _at_points(scene, x, _stress):
+        recover = jnp.asarray(_points_to_nodes(term.nodes.shape[1], stress.shape[1]), x.dtype)
+        areas = jnp.sum(term.params.weights, axis=1)
+        total = total.at[term.nodes].add(jnp.einsum("kq,mqij,m->mkij", recover, stress, areas))
+        area = area.at[term.nodes].add(areas[:, None])
+    return total / jnp.where(area > 0, area, 1)[:, None, None]
+
+
 def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
-    """Elastic energy `(t,)` of each element of the solid; sum it for the body's."""
-    found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in solid_terms(scene)]
+    """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
+    bodies = [t for t in scene.terms if isinstance(t.energy, SolidEnergy | RodEnergy)]
+    found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in bodies]
     return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
 
 
@@ -94,21 +121,40 @@ def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> j
     return jax.grad(density)(H, material) @ F.T / jnp.linalg.det(F)
 
 
-def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
-    """`measure(H, density, material)` on every element of the solids, averaged with the quadrature weights."""
+def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
+    """For each solid, `measure(H, density, material)` at the quadrature points of its elements, `(m, q, ...)`."""
     found = []
     for term in solid_terms(scene):
         assert isinstance(term.energy, SolidEnergy)
         density = term.energy.density
 
         def one(positions: jax.Array, params: SolidParams, density: Callable = density) -> jax.Array:
-            values = jax.vmap(lambda H: measure(H, density, params.material))(displacement_gradients(positions, params))
-            return jnp.tensordot(params.weights / jnp.sum(params.weights), values, axes=1)
+            return jax.vmap(lambda H: measure(H, density, params.material))(displacement_gradients(positions, params))
 
-        found.append(jax.vmap(one)(x[term.nodes], term.params))
+        found.append((term, jax.vmap(one)(x[term.nodes], term.params)))
     if not found:
         raise ValueError("scene: expected a solid term, got none; stress and J are measured on solids")
-    return jnp.concatenate(found)
+    return found
+
+
+def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
+    """`measure(H, density, material)` on every element of the solids, averaged with the quadrature weights."""
+    mean = jax.vmap(lambda weights, values: jnp.tensordot(weights / jnp.sum(weights), values, axes=1))
+    return jnp.concatenate([mean(term.params.weights, values) for term, values in _at_points(scene, x, measure)])
+
+
+def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
+    """The matrix `(k, q)` from values at `q` quadrature points to those of the linear field that fits them best, at
+    the `k` nodes of the element. Fewer than three points do not fix a linear field: of those that fit the least is
+    taken, which for one point is constant."""
+    rules = {len(shares): (places, shares) for places, shares in map(rule, DEGREES)}
+    if points not in rules:
+        raise ValueError(f"scene: expected a solid with {sorted(rules)} quadrature points in an element, got {points}")
+    places, shares = rules[points]
+    root = np.sqrt(shares)
+    at_corners = np.linalg.pinv(root[:, None] * places) * root
+    between = [(at_corners[a] + at_corners[b]) / 2 for a, b in EDGES]
+    return np.concatenate([at_corners, between])[:nodes]
 
 
 def _over_tendons(scene: Scene, x: jax.Array, measure: Callable[[TendonEnergy], Callable[..., jax.Array]]) -> jax.Array:
@@ -132,6 +178,6 @@ def _axis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     if not held.any():
         raise ValueError("scene: no node is clamped, so the beam has no axis to measure its angle from")
     rest = scene.mesh.nodes
-    span = tip_position(scene, rest) - jnp.mean(rest[np.flatnonzero(held)], axis=0)
+    span = tip_position(scene, rest) - jnp.mean(rest[np.flatnonzero(held)][:, :2], axis=0)
     length = jnp.sqrt(jnp.sum(span**2))
     return span / length, length

@@ -8,7 +8,7 @@ once; what follows trusts a `Mesh`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +66,7 @@ def rectangle(
     dtype: Any = None,
     *,
     order: int = 1,
+    graded: bool = False,
 ) -> Mesh:
     """Mesh of a rectangle centred on the origin, whose triangles have `nx` x `ny` corners.
 
@@ -82,6 +83,8 @@ def rectangle(
             symmetric about mid-height (`ny` must be odd). `"crossed"`: four triangles about the centre.
         dtype: of the nodes; by default JAX's float.
         order: of the shape functions: 1 for triangles of three nodes, 2 for six (see `quadratic`).
+        graded: crowd columns where the left edge and the middle are, by the power 3/2 of the distance to their right,
+            and rows at both faces: for a beam that is clamped at that edge and steered from its middle.
 
     Returns:
         A `Mesh`, differentiable in `length` and `height`.
@@ -105,7 +108,12 @@ def rectangle(
             f"ny: expected an odd number for mirrored diagonals, got {ny}: no row of nodes lies at mid-height; "
             f"use {ny + 1}, or crossed diagonals, which are symmetric for any ny"
         )
-    unit_x, unit_y = np.meshgrid(np.linspace(-0.5, 0.5, nx), np.linspace(-0.5, 0.5, ny), indexing="ij")
+    across, along = np.linspace(0, 1, nx), np.linspace(-0.5, 0.5, ny)
+    if graded:
+        half = across >= 0.5
+        across = 0.5 * (half + (2 * across - half) ** 1.5)
+        along = 0.6 * along + 0.2 * np.sin(np.pi * along)
+    unit_x, unit_y = np.meshgrid(across - 0.5, along, indexing="ij")
     unit = np.stack([unit_x.ravel(), unit_y.ravel()], axis=1)
     i, j = (a.ravel() for a in np.meshgrid(np.arange(nx - 1), np.arange(ny - 1), indexing="ij"))
     lower_left = i * ny + j
@@ -140,44 +148,68 @@ def quadratic(mesh: Mesh) -> Mesh:
     """
     if mesh.elements.shape[1] != 3:
         raise ValueError("mesh: its triangles have six nodes already")
-    ends, between = _edges(mesh.elements)
-    nodes = namespace(mesh.nodes).asarray(mesh.nodes)
-    xp = namespace(nodes)
-    middles = (nodes[ends[:, 0]] + nodes[ends[:, 1]]) / 2
-    elements = np.concatenate([mesh.elements, len(nodes) + between], axis=1)
-    return Mesh(xp.concatenate([nodes, middles]), elements)
+    return _made(mesh, with_middle_nodes(mesh.elements, len(mesh.nodes)))
 
 
-def refined(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """The mesh with every triangle cut into four by the middles of its edges, and which triangle each comes from.
+def refined(mesh: Mesh) -> Mesh:
+    """The mesh with every triangle cut into four by the middles of its edges, four in the place of one.
 
-    Nodes keep their numbers. Six-node triangles keep the shape of their edges: the new nodes lie where the shape
-    functions put them. Differentiable in the nodes.
+    Nodes keep their numbers. Six-node triangles keep the shape of their edges. Differentiable in the nodes.
     """
-    k = mesh.elements.shape[1]
-    corners = mesh.elements[:, :3]
-    parents = np.repeat(np.arange(len(corners)), 4)
-    nodes = namespace(mesh.nodes).asarray(mesh.nodes)
-    xp = namespace(nodes)
-    if k == 3:
-        fine = quadratic(mesh)
-        c, m = corners, fine.elements[:, 3:]
-        four = [(c[:, 0], m[:, 0], m[:, 2]), (m[:, 0], c[:, 1], m[:, 1]), (m[:, 2], m[:, 1], c[:, 2])]
-        four.append((m[:, 0], m[:, 1], m[:, 2]))
-        return Mesh(fine.nodes, np.stack([np.stack(f, axis=1) for f in four], axis=1).reshape(-1, 3)), parents
-    # The places, in the triangle, of the six nodes of each of its four parts; the first six are nodes already.
-    local = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
-    parts = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-    places = np.stack([np.concatenate([local[p], [(local[p[a]] + local[p[b]]) / 2 for a, b in EDGES]]) for p in parts])
-    inside = places[:, 3:].reshape(12, 3)
-    # Parts share nodes with each other and with the neighbours: a node is known by its corner, weighted by place.
-    new = xp.einsum("pk,tkd->tpd", shape_functions(6, inside).astype(nodes.dtype), nodes[mesh.elements])
-    whole = np.round(4 * inside).astype(np.int64)
-    order = np.sort(np.where(whole[None] > 0, corners[:, None] * 4 + whole[None], -1), axis=2).reshape(-1, 3)
-    _, first, number = np.unique(order, axis=0, return_index=True, return_inverse=True)
-    number = (len(nodes) + number.reshape(-1)).reshape(len(corners), 4, 3)
-    elements = np.concatenate([mesh.elements[:, parts], number], axis=2).reshape(-1, 6)
-    return Mesh(xp.concatenate([nodes, new.reshape(-1, 2)[first]]), elements), parents
+    return _made(mesh, cut_in_four(mesh.elements, len(mesh.nodes)))
+
+
+class Finer(NamedTuple):
+    """How a finer mesh comes from a coarse one: its `elements`, and each of its nodes as a mean of coarse `nodes`
+    `(n, k)` with `weights` `(n, k)`. Displacements are carried over as positions are."""
+
+    elements: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+
+    def carry(self, field: Any) -> Any:
+        """The nodal field `(n, d)` of the coarse mesh on the finer one."""
+        xp = namespace(field)
+        return xp.sum(self.weights[:, :, None].astype(field.dtype) * xp.asarray(field)[self.nodes], axis=1)
+
+
+def with_middle_nodes(elements: np.ndarray, count: int) -> Finer:
+    """Triangles of three nodes as triangles of six."""
+    pairs = np.sort(elements[:, EDGES].reshape(-1, 2), axis=1)
+    ends, number = np.unique(pairs, axis=0, return_inverse=True)
+    old = np.repeat(np.arange(count)[:, None], 2, axis=1)
+    weights = np.concatenate([np.tile([1.0, 0.0], (count, 1)), np.full((len(ends), 2), 0.5)])
+    whole = np.concatenate([elements, count + number.reshape(-1, 3)], axis=1)
+    return Finer(whole, np.concatenate([old, ends]), weights)
+
+
+def cut_in_four(elements: np.ndarray, count: int) -> Finer:
+    """Each triangle as four of the same number of nodes, at the corners and in the middle."""
+    if elements.shape[1] == 3:
+        six = with_middle_nodes(elements, count)
+        four = six.elements[:, _PARTS[:, :3]]
+        return Finer(four.reshape(-1, 3), six.nodes, six.weights)
+    inside = np.stack([(_PLACES[part[a]] + _PLACES[part[b]]) / 2 for part in _PARTS for a, b in EDGES])
+    # Parts share nodes with each other and triangles with their neighbours: one is known by its corners, weighted.
+    quarters = np.round(4 * inside).astype(np.int64)
+    corners = elements[:, None, :3].astype(np.int64)
+    keys = np.sort(np.where(quarters > 0, corners * 4 + quarters, -1), axis=2).reshape(-1, 3)
+    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    whole = np.concatenate([elements[:, _PARTS], (count + number).reshape(-1, 4, 3)], axis=2)
+    values = shape_functions(6, inside)
+    old = np.repeat(np.arange(count)[:, None], 6, axis=1)
+    own = np.tile(np.eye(1, 6), (count, 1))
+    nodes = np.concatenate([old, elements[first // 12]])
+    return Finer(whole.reshape(-1, 6), nodes, np.concatenate([own, values[first % 12]]))
+
+
+# The places of the six nodes of a triangle, and those of the corners and middles of its four parts that are among them.
+_PLACES = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+_PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+
+
+def _made(mesh: Mesh, finer: Finer) -> Mesh:
+    return Mesh(finer.carry(namespace(mesh.nodes).asarray(mesh.nodes)), finer.elements)
 
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
@@ -189,13 +221,6 @@ def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
         else []
     )
     return np.concatenate([corners, np.unique(np.concatenate([*found, np.zeros(0, int)]))]).astype(int)
-
-
-def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges `(e, 2)` of triangles `(t, 3)`, lower node first, and the number `(t, 3)` of each one's."""
-    pairs = np.sort(triangles[:, EDGES].reshape(-1, 2), axis=1)
-    ends, number = np.unique(pairs, axis=0, return_inverse=True)
-    return ends, number.reshape(-1, 3)
 
 
 def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
@@ -313,7 +338,7 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
     area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     if elements.shape[1] == 6 and (area > 0).all():
         # Where edges are curved the triangle must not fold over at any of its nodes.
-        slopes = shape_slopes(6, np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]]))
+        slopes = shape_slopes(6, _PLACES)
         map_ = np.einsum("tkd,qki->tqdi", nodes[elements], slopes)
         area = 0.5 * np.linalg.det(map_).min(axis=1)
     bad = np.flatnonzero(area <= 1e-14 * extent**2)

@@ -4,8 +4,9 @@ Every function draws into the `ax` it is given or into a new `Figure`, and leave
 `rcParams` alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an
 animation with `save_animation`. Lengths, forces and stresses are in the user's units.
 
-A tendon that pulls is drawn solid and one that pushes dashed. Colours are those of Okabe and Ito (2008),
-which survive colour blindness; several curves also differ in their markers.
+A tendon that pulls is drawn solid and one that pushes dashed; the patch of surface that an anchor of finite width pulls
+on is a heavier line in its colour. A rod, whose nodes are `(n, 3)`, is drawn as its centre line. Colours are those of
+Okabe and Ito (2008), which survive colour blindness; several curves also differ in their markers.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from matplotlib.patheffects import withStroke
 from jaxbeam._tree import Numbers
 from jaxbeam.branch import Branch
 from jaxbeam.measures import tendon_tensions, tip_angle
-from jaxbeam.scene import Scene, command, solid_terms, tendon_terms
+from jaxbeam.outlines import arms, edge_curves, elements_of, extremes, outline, patches, rings, tendon_points
+from jaxbeam.scene import Scene, command, tendon_count
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
@@ -58,7 +60,7 @@ class States:
     """
 
     def __init__(self, scene: Scene, commands: Numbers, x: Numbers, title: str = "") -> None:
-        count = sum(term.nodes.shape[0] for term in tendon_terms(scene))
+        count = tendon_count(scene)
         self.scene, self.commands, self.x, self.title = scene, np.asarray(commands), np.asarray(x), title
         if self.commands.ndim != 2 or self.commands.shape[0] == 0 or self.commands.shape[1] != count:
             raise ValueError(f"commands: expected shape (s, {count}), a row for each state, got {self.commands.shape}")
@@ -84,9 +86,10 @@ class States:
 
 
 def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
-    """Axis limits `((x0, x1), (y0, y1))` that hold all points of `positions`, arrays `(..., 2)`.
+    """Axis limits `((x0, x1), (y0, y1))` that hold all points of `positions`, arrays `(..., 2)` or `(..., 3)` of a rod.
 
-    Tendons run between nodes, so limits that hold the nodes of every frame hold the tendons too.
+    Those that pictures choose by default hold, besides the nodes, what lies outside them: curved edges, and tendons
+    beside a rod.
 
     Args:
         positions: in the user's length unit.
@@ -95,7 +98,7 @@ def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
     Raises:
         ValueError: if there is no point or one is not finite.
     """
-    points = np.concatenate([np.zeros((0, 2)), *(np.asarray(p).reshape(-1, 2) for p in positions)])
+    points = np.concatenate([np.zeros((0, 2)), *(np.asarray(p)[..., :2].reshape(-1, 2) for p in positions)])
     if not points.size or not np.isfinite(points).all():
         raise ValueError("positions: expected at least one point, all of them finite; see check(solution)")
     low, high = points.min(axis=0), points.max(axis=0)
@@ -107,7 +110,7 @@ def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
 
 
 def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | None = None) -> Axes:
-    """The beam with its mesh, tendons and guides, clamp, and its outline at rest.
+    """The beam with its mesh, tendons, guides and anchors, clamp, and its outline at rest.
 
     Args:
         scene: as commanded: its commands decide which tendons push.
@@ -119,7 +122,7 @@ def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | N
         ValueError: if `x` has another shape or is not finite.
     """
     positions = _positions(scene, x)
-    bounds = bounds or limits(scene.mesh.nodes, positions)
+    bounds = bounds or limits(*extremes(scene, positions[None]))
     figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
     pushing = np.asarray(_pushing(scene, jnp.asarray(positions)))
     _Beam(axes[0], scene).move(positions, pushing)
@@ -159,7 +162,7 @@ def field(
         ValueError: if `x` or `values` has another shape or is not finite.
     """
     positions, numbers = _positions(scene, x), np.asarray(values)
-    count = len(_polygons(scene))
+    count = len(elements_of(scene))
     if numbers.shape != (count,):
         raise ValueError(f"values: expected shape ({count},), one for each element, got {numbers.shape}")
     if not np.isfinite(numbers).all():
@@ -171,14 +174,15 @@ def field(
         reach = max(abs(low - centre), abs(high - centre))
         low, high = centre - reach, centre + reach
     extend = ("neither", "min", "max", "both")[int(numbers.min() < low) + 2 * int(numbers.max() > high)]
-    bounds = bounds or limits(scene.mesh.nodes, positions)
+    bounds = bounds or limits(*extremes(scene, positions[None]))
     figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
     artists = _Beam(axes[0], scene, tendon_colours=(OUTLINE,))
     artists.move(positions, np.zeros(len(artists.tendons), bool))
     for line in artists.tendons:
         line.set(linewidth=1.2, markersize=3, path_effects=[withStroke(linewidth=2.8, foreground="white")])
     artists.body.set(array=numbers, cmap="viridis" if centre is None else "RdBu_r", norm=Normalize(low, high))
-    artists.body.set(edgecolor="face", linewidth=0.2)
+    artists.body.set(edgecolor="face", linewidth=5.0 if artists.rod else 0.2)
+    artists.outline.set_visible(not artists.rod)
     # An inset is as high as the panel, whatever the aspect of the panel.
     bar = axes[0].inset_axes((1.03, 0.0, 0.035, 1.0))
     axes[0].figure.colorbar(artists.body, cax=bar, label=label, extend=extend)
@@ -297,9 +301,10 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
     if columns < 1:
         raise ValueError(f"columns: expected at least 1, got {columns}")
     columns = min(columns, len(states))
-    rest, rows = states.scene.mesh.nodes, range(0, len(states), columns)
-    across = limits(rest, states.x)[0]
-    figure, axes = _panels(columns, [(across, limits(rest, states.x[k : k + columns])[1]) for k in rows])
+    hold = lambda x: limits(*extremes(states.scene, x))
+    across = hold(states.x)[0]
+    rows = [(across, hold(states.x[k : k + columns])[1]) for k in range(0, len(states), columns)]
+    figure, axes = _panels(columns, rows)
     for k in range(len(states), len(axes)):
         axes[k].remove()
         axes[k - columns].tick_params(labelbottom=True)
@@ -330,7 +335,7 @@ def animate_ramp(
     """
     figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _prepare(left, limits(states.scene.mesh.nodes, states.x))
+    _prepare(left, limits(*extremes(states.scene, states.x)))
     curves([states], measure, label, ax=right)
     # The whole curve stays as a pale trace, so that the axes do not move, and one line on top of it grows.
     traced = []
@@ -360,7 +365,7 @@ def animate_beams(states: Sequence[States]) -> FuncAnimation:
         raise ValueError("states: expected at least one States, got none")
     if len({len(each) for each in states}) > 1:
         raise ValueError(f"states: expected as many states in each, got {[len(each) for each in states]}")
-    bounds = limits(*(each.scene.mesh.nodes for each in states), *(each.x for each in states))
+    bounds = limits(*(points for each in states for points in extremes(each.scene, each.x)))
     figure, axes = _panels(len(states), [bounds])
     return _play(figure, axes, states)
 
@@ -397,31 +402,37 @@ class _Beam:
     """The artists of one beam; `move` puts them where the nodes are."""
 
     def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
-        self.polygons = _polygons(scene)
-        self.edges = _boundary(self.polygons)
-        self.paths = [nodes for term in tendon_terms(scene) for nodes in np.asarray(term.nodes)]
-        self.inner = np.concatenate([np.zeros(0, int), *(nodes[1:-1] for nodes in self.paths)])
+        self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
+        self.patches, self.shares, pulling = patches(scene)
+        self.rod = self.elements.shape[1] == 2
         rest = np.asarray(scene.mesh.nodes)
         dotted = {"colors": GHOST, "linewidths": 0.9, "linestyles": "dotted"}
-        ghost = LineCollection(rest[self.edges], label="at rest", zorder=1, **dotted)
-        self.body = PolyCollection([], facecolor=BODY, edgecolor=MESH, linewidth=0.35, zorder=2)
-        self.outline = LineCollection([], colors=OUTLINE, linewidths=0.9, capstyle="round", zorder=3)
-        for collection in (ghost, self.body, self.outline):
+        ghost = LineCollection(list(edge_curves(rest, self.edges)), label="at rest", zorder=1, **dotted)
+        self.body = PolyCollection([], facecolor=BODY, edgecolor=MESH, linewidth=0.35, capstyle="round", zorder=2)
+        width = 2.6 if self.rod else 0.9
+        self.outline = LineCollection([], colors=OUTLINE, linewidths=width, capstyle="round", zorder=3)
+        colours = [tendon_colours[number % len(tendon_colours)] for number in range(tendon_count(scene))]
+        # What tendons are held by, other than nodes: a patch of surface, or an arm of the rod.
+        width = 0.9 if self.rod else 2.8
+        self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
+        for collection in (ghost, self.body, self.outline, self.held):
             ax.add_collection(collection, autolim=False)
         _draw_clamp(ax, scene, self.edges)
         self.tendons: list[Line2D] = []
-        for number in range(len(self.paths)):
-            colour = tendon_colours[number % len(tendon_colours)]
+        for colour in colours:
             self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
         (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
 
     def move(self, x: np.ndarray, pushing: np.ndarray) -> None:
         """Draw the beam at `x` `(n, 2)`; tendons that push, `pushing` `(m,)`, are dashed."""
-        self.body.set_verts(x[self.polygons])
-        self.outline.set_segments(x[self.edges])
-        self.guides.set_data(*x[self.inner].T)
-        for number, (line, nodes, push) in enumerate(zip(self.tendons, self.paths, pushing, strict=True)):
-            line.set_data(*x[nodes].T)
+        around: Any = rings(x, self.elements)  # matplotlib is far quicker with an array than with the list it asks for
+        self.body.set_verts(around, closed=not self.rod)
+        self.outline.set_segments(list(edge_curves(x, self.edges)))
+        self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
+        paths = tendon_points(self.scene, x)
+        self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
+        for number, (line, path, push) in enumerate(zip(self.tendons, paths, pushing, strict=True)):
+            line.set_data(*path.T)
             line.set(linestyle=PUSHING if push else "-", label=f"tendon {number + 1}" + " (pushing)" * bool(push))
 
 
@@ -435,22 +446,9 @@ def _name_actuation_axes(ax: Axes, label: str) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _polygons(scene: Scene) -> np.ndarray:
-    """`(t, 3)` nodes around each element, in the order in which the measures number them."""
-    solids = [np.asarray(term.nodes) for term in solid_terms(scene)]
-    return np.concatenate(solids) if solids else np.asarray(scene.mesh.elements)
-
-
-def _boundary(polygons: np.ndarray) -> np.ndarray:
-    """`(e, 2)` edges that belong to one element only, the body on their left."""
-    edges = np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=2).reshape(-1, 2)
-    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return edges[np.sort(first[counts == 1])]
-
-
 def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
     """`(m,)`: which tendons push. One at its commanded length, but for round-off, does neither."""
-    return tendon_tensions(scene, x * (1 + 1e-5)) < 0
+    return tendon_tensions(scene, x.at[:, :2].multiply(1 + 1e-5)) < 0
 
 
 def _positions(scene: Scene, x: Numbers) -> np.ndarray:
@@ -467,14 +465,15 @@ def _draw_clamp(ax: Axes, scene: Scene, edges: np.ndarray) -> None:
     rest = np.asarray(scene.mesh.nodes)
     walls = edges[scene.fixed[edges].all(axis=(1, 2))]
     lonely = np.setdiff1d(np.flatnonzero(scene.fixed.any(axis=1)), walls)
-    ax.plot(*rest[lonely].T, "s", color=OUTLINE, markersize=4, zorder=7)
-    start, end = rest[walls[:, 0]], rest[walls[:, 1]]
-    outward = np.stack([(end - start)[:, 1], (start - end)[:, 0]], axis=1)
-    outward *= 0.025 * np.ptp(rest, axis=0).max() / np.linalg.norm(outward, axis=1, keepdims=True)
-    strips = np.stack([start, end, end + outward, start + outward], axis=1)
+    ax.plot(*rest[lonely, :2].T, "s", color=OUTLINE, markersize=4, zorder=7)
+    lines = edge_curves(rest, walls)
+    along = np.gradient(lines, axis=1)
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    outward *= 0.025 * np.ptp(rest[:, :2], axis=0).max() / np.linalg.norm(outward, axis=-1, keepdims=True)
+    strips = np.concatenate([lines, (lines + outward)[:, ::-1]], axis=1)
     hatching = PolyCollection(list(strips), facecolor="none", edgecolor=OUTLINE, linewidth=0, hatch="//////", zorder=1)
     ax.add_collection(hatching, autolim=False)
-    ax.add_collection(LineCollection(rest[walls], colors=OUTLINE, linewidths=2.2, zorder=4), autolim=False)
+    ax.add_collection(LineCollection(list(lines), colors=OUTLINE, linewidths=2.2, zorder=4), autolim=False)
 
 
 def _prepare(ax: Axes, bounds: Limits) -> Axes:

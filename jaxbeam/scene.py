@@ -17,6 +17,7 @@ import numpy as np
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, rectangle, with_middles
+from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
 from jaxbeam.stencils import stencil_gradients, stencil_hessian
 from jaxbeam.terms import (
     SolidEnergy,
@@ -38,15 +39,15 @@ class Scene:
     """What is simulated.
 
     Args:
-        mesh: the body at rest, with `n` nodes.
+        mesh: the body at rest, with `n` nodes of `d` coordinates: 2, or 3 on a `Line` (see `jaxbeam.rod`).
         terms: the energies that are summed; one that is absent is never traced.
-        fixed: `(n, 2)` booleans, true for a coordinate that does not move (see `clamped`). It is
+        fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`). It is
             eliminated from the unknowns.
         tip: `(q,)` node numbers of the end section that the tip measures follow; may be empty.
 
     Raises:
-        ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, or a term's node is out
-            of range.
+        ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a term's node is out of range,
+            or a term of solids acts on a rod.
     """
 
     mesh: Mesh
@@ -68,6 +69,12 @@ class Scene:
             raise ValueError(f"terms: expected a tuple of at least one Term, got {self.terms!r}")
         for number, term in enumerate(self.terms):
             check_nodes(f"terms[{number}].nodes", self.mesh, term.nodes, ndim=2)
+            energy = term.energy
+            of_solids = isinstance(energy, SolidEnergy) or (
+                isinstance(energy, TendonEnergy) and energy.points is not at_offsets
+            )
+            if isinstance(self.mesh, Line) and of_solids:
+                raise ValueError(f"terms[{number}]: it is made for solids; on a Line use rod and rod_tendons")
         tip = np.asarray(self.tip)
         if tip.size:
             tip = check_nodes("tip", self.mesh, tip, ndim=1)
@@ -76,7 +83,7 @@ class Scene:
 
 
 def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
-    """`(n, 2)` booleans that fix both coordinates of `nodes` `(m,)`."""
+    """`(n, d)` booleans that fix every coordinate of `nodes` `(m,)`."""
     fixed = np.zeros(mesh.nodes.shape, bool)
     fixed[check_nodes("nodes", mesh, nodes, ndim=1)] = True
     return fixed
@@ -94,6 +101,7 @@ def tendon_beam(
     order: int = 1,
     degree: int | None = None,
     anchor_width: float = 0.0,
+    graded: bool = False,
     diagonals: Diagonals = "one-sided",
     density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
@@ -117,6 +125,7 @@ def tendon_beam(
         anchor_width: of the patches that the free ends of the tendons pull on, see `tendons`. At 0 they pull on single
             nodes, whose answer drifts as the mesh is refined: for a pull on the top to 0.8, six-node triangles give
             9.77, 9.68, 9.46 degrees on 15 x 5, 29 x 7 and 57 x 13 corners, and 10.14 on each with a width of 0.25.
+        graded: crowd nodes where the clamp meets the faces, see `rectangle`.
         diagonals: see `rectangle`.
         density: the material, see `jaxbeam.materials`.
         stiffness: the law of the tendons, see `tendons`.
@@ -128,7 +137,7 @@ def tendon_beam(
     Raises:
         ValueError: if `nx` is even, or as `rectangle`, `lame` and `tendons` do.
     """
-    mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order)
+    mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order, graded=graded)
     if nx % 2 == 0:
         raise ValueError(
             f"nx: expected an odd number, got {nx}: no node lies in the middle, where the tendons end; "
@@ -141,6 +150,52 @@ def tendon_beam(
     left, right = (with_middles(mesh, corners) for corners in (np.arange(ny), (nx - 1) * ny + np.arange(ny)))
     pulls = tendons(mesh, pair, tendon_modulus, stiffness, np.array([[0.0, anchor_width]] * 2))
     return Scene(mesh, (body, pulls), clamped(mesh, left), right)
+
+
+def rod_beam(
+    nodes: int = 9,
+    length: Numbers = 3.5,
+    height: Numbers = 0.8,
+    young: Numbers = 1e4,
+    poisson: Numbers = 0.45,
+    tendon_modulus: Numbers = 2e3,
+    *,
+    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    dtype: Any = None,
+) -> Scene:
+    """The reference scene as a rod (see `jaxbeam.rod`): a cantilever with a tendon along half of each side.
+
+    Args:
+        nodes: along the axis, odd, so that a middle one exists.
+        length: of the beam, positive.
+        height: of the beam, positive.
+        young: Young's modulus, scalar or one for each element.
+        poisson: Poisson's ratio, scalar or one for each element; `lame` turns both into Lame parameters.
+        tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
+        density: the material, see `jaxbeam.materials`. As in `tendon_beam`, (1e4, 0.45) behaves as (9962, 0.4444) in
+            the default, and as it says in `neo_hookean`. `linear_elastic` makes Simo's rod, linear in its strains.
+        stiffness: the law of the tendons, see `tendons`.
+        dtype: of everything computed; by default JAX's float.
+
+    Returns:
+        A `Scene`, differentiable in every real argument. Positions `x` are `(n, 3)`; the third column is the height
+        times the angle of the section.
+
+    Raises:
+        ValueError: if `nodes` is even, or as `lame`, `rod` and `rod_tendons` do.
+    """
+    line = straight(length, height, nodes, dtype)
+    if nodes % 2 == 0:
+        raise ValueError(
+            f"nodes: expected an odd number, got {nodes}: no node lies in the middle, where the tendons end; use "
+            f"{max(nodes - 1, 3)} or {nodes + 1}"
+        )
+    body = rod(line, height, lame(young, poisson), density)
+    xp = namespace(height)
+    sides = xp.asarray([[0.5, 0.5], [-0.5, -0.5]]) * height
+    pulls = rod_tendons(line, [[0, (nodes - 1) // 2]] * 2, sides, tendon_modulus, stiffness)
+    return Scene(line, (body, pulls), clamped(line, [0]), np.array([nodes - 1]))
 
 
 def command(scene: Scene, ratios: Numbers) -> Scene:
@@ -202,11 +257,14 @@ def is_valid(scene: Scene) -> jax.Array:
             valid &= jnp.all(jnp.isfinite(leaf)) if jnp.issubdtype(leaf.dtype, jnp.inexact) else True
         if isinstance(term.energy, TendonEnergy):
             valid &= jnp.all((term.params.commanded > 0) & (term.params.modulus > 0))
+        if isinstance(term.energy, RodEnergy):
+            valid &= jnp.all((term.params.height > 0) & (term.params.radian > 0))
         if isinstance(term.energy, SolidEnergy):
             valid &= jnp.all(term.params.weights > 0)
-            if isinstance(material := term.params.material, Lame):
-                # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
-                valid &= jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
+        bodily = isinstance(term.energy, SolidEnergy | RodEnergy)
+        if bodily and isinstance(material := term.params.material, Lame):
+            # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
+            valid &= jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
     return valid
 
 
@@ -223,6 +281,11 @@ def tendon_count(scene: Scene) -> int:
 def solid_terms(scene: Scene) -> list[Term]:
     """The terms that are solids, in order."""
     return [term for term in scene.terms if isinstance(term.energy, SolidEnergy)]
+
+
+def rod_terms(scene: Scene) -> list[Term]:
+    """The terms that are rods, in order."""
+    return [term for term in scene.terms if isinstance(term.energy, RodEnergy)]
 
 
 # ------------------------------------------------------------------------- energy, forces, Hessians
@@ -277,13 +340,15 @@ def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[j
 
 
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
-    """Smallest `J = det F` `()` over the solids at `x`; infinite for a scene without one."""
+    """Smallest `J = det F` `()` over the solids at `x`, or stretch of a fibre of the rods; infinite without any."""
     return worst_element(scene, x)[0]
 
 
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The smallest `J` `()` over the solids and the number `()` of its element (-1 in a scene without solids)."""
+    """The smallest `J` `()` over the solids, or stretch of a fibre of the rods, and the number `()` of its element (-1
+    in a scene without either)."""
     ratios = [jnp.min(jax.vmap(volume_ratios)(x[t.nodes], t.params), axis=1) for t in solid_terms(scene)]
+    ratios += [jnp.min(jax.vmap(fibre_stretches)(x[t.nodes], t.params), axis=1) for t in rod_terms(scene)]
     if not ratios:
         return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
     every = jnp.concatenate(ratios)

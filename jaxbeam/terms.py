@@ -293,8 +293,9 @@ def tendons(
     if widths is None or not (np.isfinite(widths) & (widths >= 0)).all():
         raise ValueError(f"width: expected numbers of at least 0, a scalar or shape {lines.shape}, got {width!r}")
     dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
+    anchored: tuple[np.ndarray, ...] = ()
     if not widths.any():
-        nodes_of, energy, anchored = lines, TendonEnergy(stiffness), ()
+        nodes_of, energy = lines, TendonEnergy(stiffness)
         natural = polyline_length(rest[lines])
     else:
         nodes_of, weights = _means(mesh, lines, widths)
@@ -349,18 +350,20 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     Args:
         mesh: its rest positions are the zero of the load's energy.
         nodes: `(m,)` node numbers.
-        force: `(2,)` on each of them, or `(m, 2)`; differentiable.
+        force: `(2,)` on each of them, or `(m, 2)`; on a rod `(3,)` or `(m, 3)`, the third a moment over `radian`
+            (see `jaxbeam.rod`); differentiable.
 
     Raises:
         ValueError: if a node is out of range or `force` has another shape or is not finite.
     """
     where = check_nodes("nodes", mesh, nodes, ndim=1)
-    if np.shape(force) not in ((2,), (where.size, 2)):
-        raise ValueError(f"force: expected shape (2,) or ({where.size}, 2), got {np.shape(force)}")
+    d = mesh.nodes.shape[1]
+    if np.shape(force) not in ((d,), (where.size, d)):
+        raise ValueError(f"force: expected shape ({d},) or ({where.size}, {d}), got {np.shape(force)}")
     if is_concrete(force) and not np.isfinite(np.asarray(force)).all():
         raise ValueError(f"force: expected finite numbers, got {force!r}")
     xp, rest = namespace(force), namespace(mesh.nodes).asarray(mesh.nodes)[where]
-    values = xp.broadcast_to(xp.asarray(force, mesh.nodes.dtype), (where.size, 2))
+    values = xp.broadcast_to(xp.asarray(force, mesh.nodes.dtype), (where.size, d))
     return Term(dead_load_energy, where[:, None], PointParams(rest, values))
 
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 # Before JAX is imported: both processes of the tests, and the scripts they start, compile each program once.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+# Its matrices are too small for more, and on a busy machine threads wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax

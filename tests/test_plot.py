@@ -3,19 +3,25 @@
 Looks are judged by eye; what is tested is what a glance can miss: limits, shapes, frames, labels, errors.
 """
 
+import dataclasses
 import subprocess
 import sys
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import MATERIALS, cauchy_stress
 from matplotlib.animation import FFMpegWriter
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxbeam as jb
-from jaxbeam import plot
+from jaxbeam import measures, plot
+from jaxbeam.anchors import patch, surface
+from jaxbeam.terms import Term
 
 STEPS = 5
 
@@ -122,7 +128,7 @@ def test_tendon_runs_through_its_guides(scene):
 
 
 def test_boundary_is_the_outline_with_the_body_on_the_left(scene):
-    edges = plot._boundary(scene.mesh.elements)
+    edges = plot.outline(scene)
     assert len(edges) == 2 * (6 + 2)
     start, end = np.asarray(scene.mesh.nodes)[edges.T]
     twice_area = np.sum(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
@@ -245,6 +251,308 @@ def test_any_mesh_without_tendons_or_solid(scene):
         ax = plot.beam(jb.Scene(mesh, (springs,), fixed), mesh.nodes)
         ax.figure.canvas.draw()
     assert any(line.get_marker() == "s" and len(line.get_xdata()) == 1 for line in ax.lines)
+
+
+# ------------------------------------------------------------------------------ six nodes, wide anchors
+
+WIDTH = 0.6
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def anchored(request):
+    """A beam whose tendons end on patches that reach over parts of edges."""
+    return jb.tendon_beam(nx=9, ny=3, order=request.param, anchor_width=WIDTH)
+
+
+@pytest.fixture(scope="module")
+def curved():
+    """A beam of six-node triangles, one of them curved at rest at the clamp, and a bent state of it."""
+    mesh = jb.tendon_beam(nx=5, ny=3, order=2).mesh
+    left = np.flatnonzero(mesh.nodes[:, 0] < -1.74)
+    nodes = np.array(mesh.nodes)
+    nodes[left, 0] -= 0.1 * np.cos(5 * nodes[left, 1])
+    mesh = jb.Mesh(nodes, mesh.elements)
+    scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, left))
+    return scene, bent(nodes)
+
+
+def bent(nodes):
+    """Nodes wound around a circle."""
+    turn, radius = 0.5 * nodes[:, 0], 2.0 - nodes[:, 1]
+    return np.stack([radius * np.sin(turn), 2.0 - radius * np.cos(turn)], axis=1)
+
+
+def collections(ax):
+    """The fill, and the lines by their widths: the outline, 0.9, comes after what is at rest."""
+    (body,) = (c for c in ax.collections if c.get_zorder() == 2)
+    lines = {float(c.get_linewidths()[0]): c.get_segments() for c in ax.collections if hasattr(c, "get_segments")}
+    return body, lines
+
+
+def quadratic(ends_and_middle):
+    """Nine points of the parabola that passes through first end, second end and, half-way, the middle."""
+    a, b, middle = ends_and_middle
+    xi = np.linspace(0, 1, 9)[:, None]
+    return a + xi * (b - a) + 4 * xi * (1 - xi) * (middle - (a + b) / 2)
+
+
+def lengths(lines):
+    return [float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) for line in lines]
+
+
+def distance(point, lines):
+    """From a point to the nearest of several lines."""
+    starts, ends = (np.concatenate([line[s] for line in lines]) for s in (np.s_[:-1], np.s_[1:]))
+    along = np.sum((point - starts) * (ends - starts), axis=1) / np.sum((ends - starts) ** 2, axis=1)
+    return np.linalg.norm(starts + np.clip(along, 0, 1)[:, None] * (ends - starts) - point, axis=1).min()
+
+
+def test_edges_of_six_node_triangles_are_parabolas_through_all_six_nodes(curved):
+    scene, x = curved
+    body, lines = collections(plot.beam(scene, x))
+    assert len(body.get_paths()) == len(scene.mesh.elements)
+    for path, k in zip(body.get_paths(), scene.mesh.elements, strict=True):
+        sides = [quadratic(x[k[[a, b, c]]])[:-1] for a, b, c in [(0, 1, 3), (1, 2, 4), (2, 0, 5)]]
+        np.testing.assert_allclose(path.vertices[:-1], np.concatenate(sides), atol=1e-14)
+    edges = surface(scene.mesh)
+    assert len(edges) == 2 * (4 + 2)
+    for drawn, edge in zip(lines[0.9], edges, strict=True):
+        np.testing.assert_allclose(drawn, quadratic(x[edge]), atol=1e-14)
+        np.testing.assert_allclose(drawn[4], x[edge[2]], atol=1e-14)
+
+
+def test_clamp_follows_a_curved_edge_and_is_hatched_outside(curved):
+    scene, x = curved
+    ax = plot.beam(scene, x)
+    _, lines = collections(ax)
+    walls = [edge for edge in surface(scene.mesh) if scene.fixed[edge].all()]
+    assert len(lines[2.2]) == len(walls) == 2
+    for drawn, edge in zip(lines[2.2], walls, strict=True):
+        np.testing.assert_allclose(drawn, quadratic(np.asarray(scene.mesh.nodes)[edge]), atol=1e-14)
+    (hatching,) = (c for c in ax.collections if c.get_hatch())
+    for strip, wall in zip(hatching.get_paths(), lines[2.2], strict=True):
+        outer = strip.vertices[9:18][::-1]
+        assert (outer[:, 0] < wall[:, 0] - 0.05).all()
+
+
+def test_field_fills_curved_elements(curved):
+    scene, x = curved
+    values = np.linspace(1, 2, len(scene.mesh.elements))
+    body, _ = collections(plot.field(scene, x, values, ""))
+    np.testing.assert_array_equal(body.get_array(), values)
+    np.testing.assert_allclose(
+        body.get_paths()[5].vertices[[0, 4, 8, 12, 16, 20]], x[scene.mesh.elements[5]][[0, 3, 1, 4, 2, 5]]
+    )
+
+
+def test_three_node_triangles_cost_what_they_did(scene):
+    body, lines = collections(plot.beam(scene, scene.mesh.nodes))
+    assert {len(path.vertices) for path in body.get_paths()} == {4}
+    assert {len(line) for line in lines[0.9]} == {2}
+
+
+def test_limits_hold_an_edge_that_bulges_past_its_nodes(curved):
+    scene, x = curved
+    top = surface(scene.mesh)[np.argmax(x[surface(scene.mesh)][:, :, 1].max(axis=1))]
+    far = np.array(x)
+    far[top] = [[0.0, 0.0], [0.0, 4.0], [0.0, 4.0]]
+    ax = plot.beam(scene, far)
+    bounds = (ax.get_xlim(), ax.get_ylim())
+    assert quadratic(far[top])[:, 1].max() == pytest.approx(4.5, abs=0.02)
+    assert inside(quadratic(far[top]), bounds)
+
+
+def test_tendon_ends_at_the_weighted_mean_of_its_patch(anchored):
+    x = bent(np.asarray(anchored.mesh.nodes))
+    lines = [line for line in plot.beam(anchored, x).lines if "tendon" in line.get_label()]
+    for line, (first, last) in zip(lines, anchored.terms[1].params.ends, strict=True):
+        members, weights = patch(anchored.mesh, int(last), WIDTH)
+        np.testing.assert_allclose(line.get_xydata(), [x[first], weights @ x[members]], atol=1e-13)
+        assert line.get_marker() == "o"
+
+
+def test_patch_is_drawn_along_the_surface_as_far_as_it_reaches(anchored):
+    """Twice the width at rest, half of it on each side of the anchor, in the colour of the tendon."""
+    rest = np.asarray(anchored.mesh.nodes)
+    ax = plot.beam(anchored, rest)
+    (held,) = (c for c in ax.collections if c.get_linewidths()[0] == 2.8)
+    parts = held.get_segments()
+    colours = [line.get_color() for line in ax.lines if "tendon" in line.get_label()]
+    assert len(parts) == len(held.get_colors()) == 2 * 2 * 2  # tendons, sides, edges: one and a part of the next
+    for _, last in anchored.terms[1].params.ends:
+        mine = [part for part in parts if part[0, 1] * rest[last, 1] > 0]
+        np.testing.assert_allclose(sum(lengths(mine)), 2 * WIDTH, rtol=1e-12)
+        points = np.concatenate(mine)
+        np.testing.assert_allclose(
+            [points[:, 0].min(), points[:, 0].max()], rest[last, 0] + [-WIDTH, WIDTH], atol=1e-12
+        )
+        np.testing.assert_allclose(points[:, 1], rest[last, 1], atol=1e-12)
+    assert {tuple(c) for c in held.get_colors()} == {tuple(to_rgba(colour)) for colour in colours}
+    # In another state it lies on the surface: on the parabolas, or on the chords, that are drawn of it.
+    moved = collections(plot.beam(anchored, bent(rest)))[1]
+    for part, before in zip(moved[2.8], parts, strict=True):
+        np.testing.assert_allclose(part[0], bent(before[:1])[0], atol=1e-12)  # starts at a node
+        assert max(distance(point, moved[0.9]) for point in part) < 1e-3  # chords of a parabola of an edge of 0.44
+
+
+def test_patch_runs_round_a_corner(scene):
+    pulls = jb.tendons(scene.mesh, [[2, 20]], 1.0, width=np.array([[0.0, 0.5]]))
+    cornered = jb.Scene(scene.mesh, (scene.terms[0], pulls), scene.fixed)
+    _, lines = collections(plot.beam(cornered, scene.mesh.nodes))
+    np.testing.assert_allclose(sorted(lengths(lines[2.8])), [0.1, 0.4, 0.5], rtol=1e-12)
+
+
+def test_patches_and_curved_edges_move_in_animations(anchored):
+    rest = np.asarray(anchored.mesh.nodes)
+    x = np.stack([rest + t * (bent(rest) - rest) for t in (0.0, 0.5, 1.0)])
+    states = plot.States(anchored, jb.commands([0.4, 1.0], 3), x)
+    ends = anchored.terms[1].params.ends[:, 1]
+    for frame, (ax,) in frames_of(plot.animate_ramp(states)):
+        body, lines = collections(ax)
+        bounds = (ax.get_xlim(), ax.get_ylim())
+        assert all(inside(path.vertices, bounds) for path in body.get_paths())
+        np.testing.assert_allclose([lines[2.8][0][0], lines[2.8][4][0]], x[frame][ends], atol=1e-12)
+        assert len(lines[2.8]) == 8
+        assert len(ax.collections) == 6  # at rest, body, outline, patches, hatching and line of the clamp
+
+
+# --------------------------------------------------------------------------------------------- rods
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A rod with a tendon on either side of its first half, wound around a circle in three states."""
+    scene = jb.scene.rod_beam(7, length=3.0, height=0.8)
+    along = np.asarray(scene.mesh.nodes)[:, 0] + 1.5
+    curvature = np.array([1e-9, 0.25, 0.5])[:, None]
+    turn = curvature * along
+    x = np.stack([np.sin(turn) / curvature - 1.5, (1 - np.cos(turn)) / curvature, 0.8 * turn], axis=2)
+    return plot.States(scene, jb.commands([0.4, 1.0], 3), x, "rod")
+
+
+def test_rod_is_its_centre_line_with_tendons_on_arms(rod):
+    x = rod.x[-1]
+    ax = plot.beam(jb.command(rod.scene, [0.4, 1.0]), x)
+    segments = [c.get_segments() for c in ax.collections if hasattr(c, "get_segments")]
+    centre, arms = (next(s for s in segments if len(s) == n and s[-1][-1, 1] > 0) for n in (6, 4))
+    np.testing.assert_allclose(centre, x[rod.scene.mesh.elements, :2])
+    np.testing.assert_allclose(lengths(arms), 0.4, rtol=1e-12)
+    first, second = (line for line in ax.lines if "tendon" in line.get_label())
+    ends = [[-1.5, 0.4], [1.6 * np.sin(0.75) - 1.5, 2 - 1.6 * np.cos(0.75)]]
+    np.testing.assert_allclose(first.get_xydata(), ends, atol=1e-12)
+    # The second lies on the far side of the rod: limits of the nodes alone would cut it off.
+    assert inside(second.get_xydata(), (ax.get_xlim(), ax.get_ylim()))
+    assert any(line.get_marker() == "s" and len(line.get_xdata()) == 1 for line in ax.lines)
+
+
+def test_rod_in_animations_galleries_and_fields(rod):
+    for frame, (ax,) in frames_of(plot.animate_ramp(rod)):
+        segments = [c.get_segments() for c in ax.collections if hasattr(c, "get_segments")]
+        assert any(np.array_equal(s, rod.x[frame][rod.scene.mesh.elements, :2]) for s in segments if len(s) == 6)
+        assert inside(rod.x[frame][:, :2], (ax.get_xlim(), ax.get_ylim()))
+    assert len(plot.gallery(rod).axes) == 3
+    turns = np.diff(rod.x[-1][:, 2]) * np.arange(1, 7)
+    body, _ = collections(plot.field(rod.scene, rod.x[-1], turns, "turn"))
+    np.testing.assert_array_equal(body.get_array(), turns)
+    assert body.get_linewidths()[0] > 3
+
+
+# ------------------------------------------------------------------------------------- stress at nodes
+
+
+nodal_stress = jax.jit(measures.nodal_stress)
+
+
+def block(n=1, degree=None, density=jb.neo_hookean):
+    mesh = jb.rectangle(3.0, 1.0, 6 * n + 1, 2 * n + 1, order=2)
+    return jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3), density, degree),), jb.clamped(mesh, [0]))
+
+
+@pytest.mark.parametrize("degree", [2, 4, 5])
+@pytest.mark.parametrize("density", [jb.linear_elastic, jb.neo_hookean])
+def test_linear_stress_is_recovered_exactly(degree, density):
+    """At rest the stress changes as `lam tr e I + 2 mu e`, linear in the place for quadratic displacements."""
+    scene = block(degree=degree, density=density)
+    X, Y = np.asarray(scene.mesh.nodes).T
+    u = np.stack([X**2 - 0.5 * X * Y + 0.3 * Y**2 + Y, 0.2 * X**2 + X * Y - 0.7 * Y**2], axis=1)
+    _, stress = jax.jvp(lambda x: nodal_stress(scene, x), (scene.mesh.nodes,), (jnp.asarray(u),))
+    H = np.stack([[2 * X - 0.5 * Y, 0.6 * Y - 0.5 * X + 1], [0.4 * X + Y, X - 1.4 * Y]]).transpose(2, 0, 1)
+    strain = (H + H.transpose(0, 2, 1)) / 2
+    material = jb.lame(1.0, 0.3)
+    pressure = material.lam * np.trace(strain, axis1=1, axis2=2)
+    expected = pressure[:, None, None] * np.eye(2) + 2 * material.mu * strain
+    np.testing.assert_allclose(stress, expected, atol=1e-12)
+
+
+def test_stress_of_three_node_triangles_is_the_mean_by_area():
+    mesh = jb.Mesh(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 3.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, [0]))
+    x = mesh.nodes * jnp.array([1.1, 1.0]) + 0.1 * mesh.nodes[:, ::-1] ** 2
+    one, other = cauchy_stress(scene, x)
+    mean = (0.5 * one + 1.5 * other) / 2
+    np.testing.assert_allclose(nodal_stress(scene, x), [mean, one, mean, other], rtol=1e-12)
+
+
+def wound(X):
+    turn, radius = 0.6 * X[0], 1 / 0.6 - X[1]
+    return jnp.stack([radius * jnp.sin(turn), 1 / 0.6 - radius * jnp.cos(turn)])
+
+
+def errors(n):
+    """Largest error of the stress of a strongly bent beam: recovered at the nodes, and as the element has it there."""
+    scene = block(n)
+    mu, lam = (float(value) for value in jax.tree.leaves(jb.lame(1.0, 0.3)))
+    piola = MATERIALS[jb.neo_hookean]
+    gradients = np.asarray(jax.vmap(jax.jacfwd(wound))(scene.mesh.nodes))
+    exact = np.stack([piola(F, mu, lam) @ F.T / np.linalg.det(F) for F in gradients])
+    x = jax.vmap(wound)(scene.mesh.nodes)
+    element = np.asarray(cauchy_stress(scene, x))[:, None] - exact[scene.mesh.elements]
+    return np.abs(nodal_stress(scene, x) - exact).max(), np.abs(element).max()
+
+
+def test_recovered_stress_of_a_bent_beam_converges_faster_than_that_of_elements():
+    coarse, fine = np.array([errors(2), errors(4)])
+    nodal, element = np.log2(coarse / fine)
+    assert nodal > 1.7 and element < 1.1  # of second and of first order
+    assert (coarse[0] < 0.1 * coarse[1]) and (fine[0] < 0.05 * fine[1])
+
+
+def test_recovered_stress_differentiates_and_keeps_its_dtype():
+    scene = block()
+    x = jax.vmap(wound)(scene.mesh.nodes)
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
+    _, slope = jax.jvp(lambda x: nodal_stress(scene, x), (x,), (direction,))
+    h = 1e-6
+    difference = (nodal_stress(scene, x + h * direction) - nodal_stress(scene, x - h * direction)) / (2 * h)
+    np.testing.assert_allclose(slope, difference, atol=1e-7 * float(jnp.abs(slope).max()))
+    mesh = jb.rectangle(3.0, 1.0, 7, 3, dtype=np.float32)
+    small = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, [0]))
+    assert nodal_stress(small, mesh.nodes).dtype == np.float32
+
+
+def test_recovered_stress_needs_a_solid_and_a_known_rule():
+    scene = block()
+    load = jb.Scene(scene.mesh, (jb.dead_load(scene.mesh, [3], [0.0, 1.0]),), scene.fixed)
+    with pytest.raises(ValueError, match="scene: expected a solid term, got none"):
+        nodal_stress(load, scene.mesh.nodes)
+    body = scene.terms[0]
+    params = dataclasses.replace(
+        body.params, gradients=body.params.gradients[:, :2], weights=body.params.weights[:, :2]
+    )
+    odd = jb.Scene(scene.mesh, (dataclasses.replace(body, params=params),), scene.fixed)
+    with pytest.raises(
+        ValueError, match=r"expected a solid with \[1, 3, 6, 7\] quadrature points in an element, got 2"
+    ):
+        nodal_stress(odd, scene.mesh.nodes)
+
+
+def test_stress_is_zero_where_no_solid_reaches():
+    scene = block()
+    body = scene.terms[0]
+    part = Term(body.energy, body.nodes[:1], jax.tree.map(lambda leaf: leaf[:1], body.params))
+    stress = nodal_stress(jb.Scene(scene.mesh, (part,), scene.fixed), 1.1 * scene.mesh.nodes)
+    reached = np.isin(np.arange(len(stress)), body.nodes[0])
+    assert (np.abs(stress[reached]).max(axis=(1, 2)) > 0.1).all() and not np.any(stress[~reached])
 
 
 def test_errors_name_the_argument(scene, states):

@@ -1,0 +1,275 @@
+"""Error against time: every model, order, mesh, anchor, precision and tolerance, and what to choose.
+
+    python -m benchmarks.accuracy [--quick] [--out out/benchmarks]
+
+The reference beam with anchors of width 0.25, its top tendon pulled to ratios from 0.95 to 0.5, at Poisson's ratios
+from 0.3 to 0.4999. Errors of the tip angle and of the tendon's tension, in percent of a solution on a graded mesh of
+crossed six-node triangles (57 x 13 corners), whose own error is estimated from one of half the fineness. The larger of
+the two counts. Times are of one call after compiling, medians; at 0.4999 settings are ramped to the command, which a
+jump reaches in a hundred steps.
+
+It ends with the table a user chooses from: the cheapest setting for 10, 1, 0.1 and 0.01 % of error at Poisson's ratio
+0.45 over all ratios, and the front of all of them as a picture.
+
+Below a ratio of about 0.4 the surface under a tendon creases on fine meshes, a true instability of the material: no
+answer there is independent of the mesh. `--crease` shows it: the tension jumps as the ratio falls.
+"""
+
+from __future__ import annotations
+
+import benchmarks.one_thread  # isort: skip # noqa: F401
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxbeam as jb
+from benchmarks import report
+from benchmarks.timing import medians
+
+RATIOS = (0.95, 0.8, 0.6, 0.5)
+POISSONS = (0.3, 0.45, 0.49, 0.499, 0.4999)
+WIDTH = 0.25
+FINEST = {"nx": 57, "ny": 13, "order": 2, "graded": True, "diagonals": "crossed"}
+HALF = FINEST | {"nx": 29, "ny": 7}
+GOALS = (10.0, 1.0, 0.1, 0.01)
+
+
+class Setting(NamedTuple):
+    """A way to solve: `scene(poisson)` at rest and `solve(scene, ratios) -> x`."""
+
+    name: str
+    scene: Callable[[float], jb.Scene]
+    solve: Callable[[jb.Scene, list[float]], Any]
+
+
+def beam(poisson: float, **kwargs: Any) -> jb.Scene:
+    """The reference beam with wide anchors, unless said otherwise."""
+    return jb.tendon_beam(poisson=poisson, **({"anchor_width": WIDTH} | kwargs))
+
+
+def solved(scene: jb.Scene, ratios: list[float], solver: jb.Newton = jb.Newton(), steps: int = 0) -> jb.Solution:
+    """By one jump, or by a ramp of so many steps."""
+    if steps:
+        return jax.tree.map(lambda leaf: leaf[-1], jb.ramp(scene, ratios, steps=steps, solver=solver))
+    return jb.equilibrium(jb.command(scene, ratios), solver=solver)
+
+
+def settings(quick: bool) -> list[Setting]:
+    """All settings, from cheap to dear."""
+    found = [Setting("linear, P2 11 x 5 graded", partial(beam, nx=11, ny=5, order=2, graded=True), linear)]
+    for nodes in (9, 17):
+        found.append(Setting(f"rod, {nodes} nodes", partial(rod, nodes=nodes), solved))
+    meshes: list[dict[str, Any]] = [
+        {"nx": 15, "ny": 4},
+        {"nx": 29, "ny": 7, "anchor_width": 0.0},
+        {"nx": 29, "ny": 7},
+        {"nx": 57, "ny": 13},
+        {"nx": 15, "ny": 5, "diagonals": "crossed"},
+        {"nx": 29, "ny": 7, "diagonals": "crossed"},
+        {"nx": 29, "ny": 7, "diagonals": "mirrored"},
+        {"nx": 29, "ny": 7, "graded": True},
+        {"nx": 7, "ny": 3, "order": 2},
+        {"nx": 15, "ny": 5, "order": 2},
+        {"nx": 29, "ny": 7, "order": 2},
+        {"nx": 7, "ny": 3, "order": 2, "graded": True},
+        {"nx": 9, "ny": 4, "order": 2, "graded": True},
+        {"nx": 11, "ny": 5, "order": 2, "graded": True},
+        {"nx": 15, "ny": 5, "order": 2, "graded": True},
+        {"nx": 15, "ny": 5, "order": 2, "graded": True, "degree": 4},
+        {"nx": 21, "ny": 7, "order": 2, "graded": True},
+        {"nx": 29, "ny": 9, "order": 2, "graded": True},
+        {"nx": 9, "ny": 4, "order": 2, "graded": True, "diagonals": "crossed"},
+        {"nx": 15, "ny": 5, "order": 2, "graded": True, "diagonals": "crossed"},
+        HALF,
+    ]
+    for mesh in meshes[::3] if quick else meshes:
+        found.append(Setting(label(mesh), partial(beam, **mesh), solved))
+    base = {"nx": 11, "ny": 5, "order": 2, "graded": True}
+    for name, extra, solve in (
+        ("float32", {"dtype": jnp.float32}, solved),
+        ("residual 1e-4", {}, partial(solved, solver=jb.Newton(rtol=1e-4))),
+        ("residual 1e-7", {}, partial(solved, solver=jb.Newton(rtol=1e-7))),
+        ("ramp of 4", {}, partial(solved, steps=4)),
+        ("ramp of 10", {}, partial(solved, steps=10)),
+    ):
+        found.append(Setting(f"{label(base)}, {name}", partial(beam, **base, **extra), solve))
+    return found
+
+
+def label(mesh: dict[str, Any]) -> str:
+    """The name of a mesh."""
+    words = [f"P{mesh.get('order', 1)} {mesh['nx']} x {mesh['ny']}", mesh.get("diagonals", "")]
+    words += ["graded" if mesh.get("graded") else "", f"degree {mesh['degree']}" if "degree" in mesh else ""]
+    words += ["point anchors" if mesh.get("anchor_width") == 0 else ""]
+    return " ".join(word for word in words if word)
+
+
+def rod(poisson: float, nodes: int) -> jb.Scene:
+    """The rod in the place of the solid."""
+    return jb.rod_beam(nodes, poisson=poisson)
+
+
+def linear(scene: jb.Scene, ratios: list[float]) -> Any:
+    """The answer of linear elasticity."""
+    return jb.linear_response(jb.command(scene, ratios))
+
+
+def measured(scene: jb.Scene, ratios: list[float], x: Any) -> np.ndarray:
+    """Tip angle, and the tension and length of the top tendon."""
+    scene = jb.command(scene, ratios)
+    tension, length = jb.tendon_tensions(scene, x)[0], jb.tendon_lengths(scene, x)[0]
+    return np.array([jb.tip_angle(scene, x), tension, length], float)
+
+
+def references(poisson: float) -> tuple[np.ndarray, np.ndarray]:
+    """Measures `(ratios, 3)` on the finest mesh, and their distance from those on one half as fine."""
+    answers = []
+    for mesh in (FINEST, HALF):
+        scene, rows = beam(poisson, **mesh), []
+        for ratio in RATIOS:
+            found = jb.check(solved(scene, [ratio, 1.0], steps=9))
+            rows.append(measured(scene, [ratio, 1.0], found.x))
+        answers.append(np.array(rows))
+    return answers[0], answers[0] - answers[1]
+
+
+def errors(setting: Setting, poisson: float, truth: np.ndarray, repeats: int) -> list[dict[str, Any]]:
+    """Percent of error and milliseconds of a setting at every ratio."""
+    scene, rows = setting.scene(poisson), []
+    steep = poisson > 0.495
+    solve = partial(solved, steps=9) if setting.solve is solved and steep else setting.solve
+    for ratio, exact in zip(RATIOS, truth, strict=True):
+        command = [ratio, 1.0]
+        found = solve(scene, command)
+        x, status = (found.x, int(found.status)) if isinstance(found, jb.Solution) else (found, 0)
+        off = 100 * (measured(scene, command, x) / exact - 1)
+        (timing,) = medians(partial(solve, scene, command), repeats=repeats)
+        row = {"setting": setting.name, "poisson": poisson, "ratio": ratio, "status": status}
+        rows.append(row | {"angle": off[0], "tension": off[1], "length": off[2], "ms": 1e3 * timing.median})
+    return rows
+
+
+def hand(poisson: float, truth: np.ndarray) -> list[dict[str, Any]]:
+    """The hand calculation."""
+    rows = []
+    for ratio, exact in zip(RATIOS, truth, strict=True):
+        found = jb.euler_bernoulli([ratio, 1.0], poisson=poisson)
+        off = 100 * (np.array([found.tip_angle, found.tensions[0], found.lengths[0]]) / exact - 1)
+        row = {"setting": "by hand", "poisson": poisson, "ratio": ratio, "status": 0, "ms": 0.01}
+        rows.append(row | {"angle": off[0], "tension": off[1], "length": off[2]})
+    return rows
+
+
+def print_rows(rows: list[dict[str, Any]], poisson: float) -> None:
+    """Errors of the angle and tension at each ratio, a line for each setting."""
+    header = (f"nu = {poisson}", *(f"{r} angle %" for r in RATIOS), *(f"{r} tension %" for r in RATIOS), "ms at 0.8")
+    names = list(dict.fromkeys(row["setting"] for row in rows))
+    lines = []
+    for name in names:
+        own = [row for row in rows if row["setting"] == name]
+        show = lambda value, row: "-" if row["status"] else f"{value:+.3f}"
+        angles, tensions = ([show(row[key], row) for row in own] for key in ("angle", "tension"))
+        lines.append((name, *angles, *tensions, own[RATIOS.index(0.8)]["ms"]))
+    report.table(header, lines)
+
+
+def worst(rows: list[dict[str, Any]]) -> list[tuple[str, float, float]]:
+    """Of each setting: the largest error over all ratios, of angle and tension, and the mean time."""
+    found = []
+    for name in dict.fromkeys(row["setting"] for row in rows):
+        own = [row for row in rows if row["setting"] == name]
+        if not any(row["status"] for row in own):
+            error = max(max(abs(row["angle"]), abs(row["tension"])) for row in own)
+            found.append((name, error, float(np.mean([row["ms"] for row in own]))))
+    return found
+
+
+def choose(rows: list[dict[str, Any]], floor: float) -> list[tuple[Any, ...]]:
+    """The cheapest setting for each goal; the reference's own error is added to each."""
+    lines = []
+    for goal in GOALS:
+        fit = [entry for entry in worst(rows) if entry[1] + floor <= goal]
+        lines.append((f"{goal} %", *(min(fit, key=lambda entry: entry[2]) if fit else ("none here", None, None))))
+    return lines
+
+
+def draw(rows: list[dict[str, Any]]) -> Any:
+    """Error against time at each ratio for Poisson's ratio 0.45, and for 0.4999, with the front."""
+    poissons = [p for p in (0.45, 0.4999) if any(row["poisson"] == p for row in rows)]
+    figure, axes = plt.subplots(1, len(poissons), figsize=(6.2 * len(poissons), 5), sharey=True, squeeze=False)
+    families = {"by hand": "k*", "linear": "C7P", "rod": "C2D", "P1": "C0o", "P2": "C3s"}
+    for ax, poisson in zip(axes[0], poissons, strict=True):
+        entries = worst([row for row in rows if row["poisson"] == poisson])
+        for family, style in families.items():
+            own = [entry for entry in entries if entry[0].startswith(family)]
+            ax.loglog([ms for *_, ms in own], [error for _, error, _ in own], style, label=family, ms=7, alpha=0.8)
+        front, best = [], np.inf
+        for entry in sorted(entries, key=lambda entry: entry[2]):
+            if entry[1] < best:
+                front.append(entry)
+                best = entry[1]
+        ax.loglog([ms for *_, ms in front], [error for _, error, _ in front], "k-", lw=0.8, zorder=0)
+        for name, error, ms in front:
+            ax.annotate(name, (ms, error), xytext=(5, 4), textcoords="offset points", fontsize=6.5)
+        ax.set(title=f"Poisson's ratio {poisson}", xlabel="milliseconds of one solve")
+        ax.grid(alpha=0.3, which="both", lw=0.4)
+    axes[0, 0].set_ylabel("largest error of angle and tension, ratios 0.95 to 0.5 (%)")
+    axes[0, 0].legend(frameon=False)
+    return figure
+
+
+def crease() -> None:
+    """Tension of the top tendon as its ratio falls, on a coarse and on a fine mesh."""
+    ratios = np.linspace(1, 0.36, 65)
+    rows = []
+    for mesh in ({"nx": 29, "ny": 7}, {"nx": 113, "ny": 25, "order": 2}):
+        path = jb.ramp(beam(0.45, **mesh), [ratios[-1], 1.0], steps=len(ratios))
+        tensions = jax.vmap(lambda r, x, mesh=mesh: jb.tendon_tensions(jb.command(beam(0.45, **mesh), r), x)[0])
+        values = np.asarray(tensions(path.ratios, path.x))
+        k = int(np.argmax(np.abs(np.diff(values, 2)))) + 1
+        rows.append(
+            (label(mesh), float(ratios[k]), float(np.diff(values)[k]), int((np.asarray(path.status) != 0).sum()))
+        )
+    report.table(("mesh", "sharpest bend at ratio", "change of tension there", "steps not OK"), rows)
+
+
+def main() -> None:
+    parser = report.options(__doc__)
+    parser.add_argument("--quick", action="store_true", help="every third mesh, and Poisson's ratio 0.45 alone")
+    parser.add_argument("--crease", action="store_true", help="only show the crease on fine meshes")
+    options = parser.parse_args()
+    report.head("Error against time")
+    if options.crease:
+        crease()
+        return
+    rows: list[dict[str, Any]] = []
+    floors = {}
+    for poisson in (0.45,) if options.quick else POISSONS:
+        truth, gap = references(poisson)
+        floors[poisson] = float(np.abs(100 * gap / truth)[:, :2].max() / 3)
+        print(f"nu = {poisson}: angle, tension, length at {RATIOS}:\n{np.round(truth, 5)}")
+        print(f"error of this reference, a third of its distance from half the fineness: {floors[poisson]:.4f} %\n")
+        found = hand(poisson, truth)
+        for setting in settings(options.quick):
+            found += errors(setting, poisson, truth, 3 if options.quick else 7)
+        print_rows(found, poisson)
+        rows += found
+    print("The cheapest setting at Poisson's ratio 0.45, over all ratios, angle and tension:\n")
+    normal = [row for row in rows if row["poisson"] == 0.45]
+    report.table(("error", "setting", "error %", "ms"), choose(normal, floors[0.45]))
+    report.save(options.out, "accuracy", {"rows": rows, "reference": floors})
+    report.save_figure(options.out, "accuracy", draw(rows))
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main()
