@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 # In the order of what they take: minutes each, an hour for `extremes`, which is run by name.
-NAMES = ("single", "many", "floor", "scaling", "sparse", "simkit_peer")
+NAMES = ("single", "many", "floor", "scaling", "sparse", "simkit_peer", "accuracy", "error_bars")
 # These print alone.
 PRINTING = ("gradient", "precision", "verification")
 BY_NAME = ("extremes",)

@@ -118,7 +118,8 @@ def _key(owner: Any, name: str, array: np.ndarray) -> Key:
 def unlock(tree: T) -> T:
     """The same tree with every index array a leaf, so that a jitted function is traced once per shape."""
     if isinstance(tree, tuple | list):
-        return type(tree)(unlock(item) for item in tree)
+        items = [unlock(item) for item in tree]
+        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
     if not dataclasses.is_dataclass(tree):
         return tree
     new = object.__new__(type(tree))

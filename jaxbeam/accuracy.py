@@ -199,7 +199,7 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
     """Why nothing can be said about the error, or nothing."""
     if solution.status != 0:
         return "the solution is not OK"
-    free = ~scene.fixed.all(axis=1)
+    free = np.logical_not(scene.fixed.all(axis=1))
     for term in scene.terms:
         if isinstance(term.energy, TendonEnergy) and term.params.width is None and free[term.nodes].any():
             return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
@@ -224,8 +224,7 @@ def _change(scene: Scene, x: Numbers, measure: Measure, solver: Newton, way: Fin
     layout, start = solver.linear.layout(topology(scene)), jnp.asarray(x)
     slope = _slope(scene, start, measure)
     step, adjoint, forces = _newton_step(unlock(scene), layout, start, slope, solver)
-    count = 0 if way is None else int(way.nodes.max()) + 1
-    local = adjoint if way is None else adjoint - way.carry(adjoint[:count])
+    local = adjoint if way is None else adjoint - way.carry(adjoint)
     return _Change(start + step, float(jnp.sum(slope * step)), -np.asarray(local * forces))
 
 

@@ -72,14 +72,19 @@ class Line(Mesh):
                 f"nodes: expected floats of shape (n, 3), a row (x, y, radian * angle) for each node, got shape "
                 f"{nodes.shape} of dtype {nodes.dtype}"
             )
-        if is_concrete(self.radian) and not (np.shape(self.radian) == () and 0 < np.asarray(self.radian) < np.inf):
-            raise ValueError(f"radian: expected a positive length, got {self.radian!r}; take the height of the rod")
+        check_length("radian", self.radian)
         elements = _checked_pairs(self.elements, nodes.shape[0])
         if is_concrete(nodes, self.radian):
             _check_line(np.asarray(nodes, float), elements, float(np.asarray(self.radian)))
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
         object.__setattr__(self, "radian", to_device(self.radian, nodes.dtype))
+
+
+def check_length(name: str, value: Numbers) -> None:
+    """Refuse a concrete value that is not one positive finite number."""
+    if is_concrete(value) and not (np.ndim(value) == 0 and np.isfinite(value) and np.asarray(value) > 0):
+        raise ValueError(f"{name}: expected a positive finite number, got {value!r}")
 
 
 def _checked_pairs(elements: Any, count: int) -> np.ndarray:
@@ -131,12 +136,11 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
         dtype: of the nodes; by default JAX's float.
 
     Raises:
-        ValueError: if `nodes` is not a whole number of at least 2, or a concrete length is not positive and finite.
+        ValueError: if `nodes` is not a whole number of at least 2, or a length is not positive and finite.
     """
     if not isinstance(nodes, int | np.integer) or isinstance(nodes, bool) or nodes < 2:
         raise ValueError(f"nodes: expected a whole number of at least 2, got {nodes!r}")
-    if is_concrete(length) and not (np.ndim(length) == 0 and 0 < np.asarray(length) < np.inf):
-        raise ValueError(f"length: expected a positive finite number, got {length!r}")
+    check_length("length", length)
     dtype = jnp.result_type(float) if dtype is None else dtype
     unit = np.linspace(-0.5, 0.5, nodes)[:, None] * [1.0, 0.0, 0.0]
     pairs = np.stack([np.arange(nodes - 1), np.arange(1, nodes)], axis=1)
@@ -395,7 +399,6 @@ def euler_bernoulli(
         E' H eps + sum T = 0,     E' H^3/12 kappa - sum e T = 0,     E' = E / (1 - nu^2):
 
     two linear equations. The other half stays straight, so the tip rises by `kappa a^2 / 2 + kappa a a`.
-    Source: Gere and Timoshenko, Mechanics of Materials, ch. 5 and 9.
 
     Args:
         ratios: `(2,)` of the top and the bottom tendon.

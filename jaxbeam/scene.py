@@ -17,7 +17,7 @@ import numpy as np
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, rectangle, with_middles
-from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
+from jaxbeam.rod import Line, RodEnergy, at_offsets, check_length, fibre_stretches, rod, rod_tendons, straight
 from jaxbeam.stencils import stencil_gradients, stencil_hessian
 from jaxbeam.terms import (
     SolidEnergy,
@@ -185,6 +185,7 @@ def rod_beam(
     Raises:
         ValueError: if `nodes` is even, or as `lame`, `rod` and `rod_tendons` do.
     """
+    check_length("height", height)
     line = straight(length, height, nodes, dtype)
     if nodes % 2 == 0:
         raise ValueError(

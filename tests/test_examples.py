@@ -18,6 +18,7 @@ NUMBERS = {
     "07_design_shape": {"before": 0.060367},
     "08_gradient_check": {"top command": -37.0783, "bottom command": 6.6988, "Hessian's order": 3.00},
     "09_sweep_many": {"solved": 1.0, "highest": 35.5152802, "lowest": -34.9502718},
+    "10_speed_against_accuracy": {"exact": 10.14, "bar held": 1.0},
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
@@ -29,6 +30,7 @@ PICTURES = {
     "07_design_shape": {"design.png"},
     "08_gradient_check": {"gradient_check.png"},
     "09_sweep_many": {"map.png", "reachable_set.png"},
+    "10_speed_against_accuracy": {"speed_against_accuracy.png"},
 }
 
 

@@ -1,5 +1,7 @@
 """Scenes: what is summed, what is refused, scenes as data, reactions; importing changes nothing."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from helpers import affine, energy, forces, reactions, rotation, run_python, small_beam
 
 import jaxbeam as jb
+from jaxbeam._tree import replace
 
 UNIT = jb.rectangle(2.0, 1.0, 3, 2)
 BODY = jb.solid(UNIT, jb.lame(10.0, 0.3))
@@ -277,3 +280,28 @@ assert jaxbeam.tendon_beam(5, 3).mesh.nodes.dtype == "float32"
 print("unchanged")
 """
     assert run_python(code) == "unchanged\n"
+
+
+class Ground(NamedTuple):
+    """Parameters of a user's own term, as a plain tuple with names."""
+
+    stiffness: jax.Array
+    height: jax.Array
+
+
+def ground(x, params):
+    return 0.5 * params.stiffness * jnp.sum((x[:, 1] - params.height) ** 2)
+
+
+def test_parameters_may_be_any_pytree():
+    """A named tuple and a dictionary in the place of a dataclass, as far as an equilibrium."""
+    base = small_beam()
+    tip = base.tip[:1]
+    found = []
+    values = {"stiffness": jnp.array([50.0]), "height": jnp.array([0.1])}
+    for params in (Ground(**values), values):
+        energy = ground if isinstance(params, Ground) else lambda x, p: ground(x, Ground(**p))
+        own = jb.Term(energy, tip[:, None], params)
+        found.append(jb.check(jb.equilibrium(replace(base, terms=(*base.terms, own)))).x)
+    np.testing.assert_array_equal(*found)
+    assert abs(found[0] - base.mesh.nodes).max() > 1e-3

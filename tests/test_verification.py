@@ -35,6 +35,7 @@ def test_cooks_membrane(cells, order, rtol):
     assert (1 - rtol) * verification.COOK_LIMIT < found < verification.COOK_LIMIT + 0.005
 
 
+@pytest.mark.slow
 def test_elastica():
     """Shear, extension and finite strain are of the size of (H/L)^2, and larger than the error of the mesh."""
     length = 100.0
@@ -44,6 +45,7 @@ def test_elastica():
         np.testing.assert_allclose(found, published, rtol=2 / length**2, atol=5.1e-6)
 
 
+@pytest.mark.slow
 def test_a_moment_bends_a_strip_to_a_circle():
     """Beam theory to the (kappa H)^2 / 6 of finite strain; to a few 1e-4 with it, the error of the mesh."""
     length = 50.0
