@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock
+from jaxbeam._tree import compiled, is_concrete, replace, unlock
 from jaxbeam.anchors import surface
 from jaxbeam.elements import DEGREES, rule
 from jaxbeam.equilibrium import equilibrium
@@ -167,32 +167,31 @@ def _on(mesh: Mesh, term: Term, parts: int) -> Term:
     return term
 
 
-def _estimate(
-    scene: Scene, solution: Solution, measure: Measure, solver: Newton
-) -> tuple[ErrorEstimate, Scene, jax.Array]:
+def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton) -> tuple[ErrorEstimate, Scene, Any]:
     """The estimate, the finer scene, and where its own solution is expected."""
     finer, way = enriched(scene)
-    start = way.carry(solution.x)
-    if np.shape(value := measure(scene, solution.x)) != ():
-        raise ValueError(f"measure: expected a function that returns a scalar, got shape {np.shape(value)}")
-    algebraic = _change(scene, solution.x, measure, solver).total
+    start = way.carry(np.asarray(solution.x))
+    if (shape := jax.eval_shape(measure, scene, solution.x).shape) != ():
+        raise ValueError(f"measure: expected a function that returns a scalar, got shape {shape}")
+    own = _change(scene, solution.x, measure, solver)
+    value, algebraic = own.value, own.total
     step = _change(finer, start, measure, solver, way)
     change, cancelled = step.total, min(step.parts[step.parts > 0].sum(), -step.parts[step.parts < 0].sum())
     for _ in range(MOST_STEPS):
         if not abs(step.total) > SETTLED * abs(change):
             break
-        here, step = step.x, _change(finer, step.x, measure, solver)
+        step = _change(finer, step.x, measure, solver)
         # A measure such as the mean over the tip may weigh nodes differently on another mesh.
-        change = float(measure(finer, here)) - float(value) + step.total
+        change = step.value - value + step.total
     moved = step.x
     if not np.isfinite(change):
         # Too far for bare steps: it takes a solve.
         found = equilibrium(finer, start, solver)
-        moved, change = found.x, float(measure(finer, found.x) - value) if found.status == 0 else np.nan
+        moved, change = np.asarray(found.x), float(measure(finer, found.x)) - value if found.status == 0 else np.nan
     left = change * SHORT_OF[scene.mesh.elements.shape[1]]
     reason = _doubt(scene, solution, change)
     bar = np.inf if reason else SAFETY * abs(left) + UNLIKE * cancelled + abs(algebraic)
-    return ErrorEstimate(float(value), left, algebraic, bar, reason), finer, moved
+    return ErrorEstimate(value, left, algebraic, bar, reason), finer, moved
 
 
 def _doubt(scene: Scene, solution: Solution, change: float) -> str:
@@ -207,25 +206,27 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
 
 
 class _Change(NamedTuple):
-    """Where one Newton step from a state leads, `x`; the change of a measure, to first order; and of that, what each
-    coordinate's force and adjoint contribute, `parts` `(n, 2)`."""
+    """The value of a measure at a state; where one Newton step from there leads, `x`; by how much that changes it, to
+    first order; and of that, what each coordinate's force and adjoint contribute, `parts` `(n, 2)`."""
 
-    x: jax.Array
+    value: float
+    x: np.ndarray
     total: float
     parts: np.ndarray
 
 
-def _change(scene: Scene, x: Numbers, measure: Measure, solver: Newton, way: Finer | None = None) -> _Change:
+def _change(scene: Scene, x: Any, measure: Measure, solver: Newton, way: Finer | None = None) -> _Change:
     """What a Newton step from `x` would change.
 
     If the state was carried over from a coarser mesh, the adjoint is taken less its own interpolation on that: the
     forces do no work on that, and what is left is local.
     """
-    layout, start = solver.linear.layout(topology(scene)), jnp.asarray(x)
-    slope = _slope(scene, start, measure)
-    step, adjoint, forces = _newton_step(unlock(scene), layout, start, slope, solver)
+    value, slope = _value_and_slope(scene, x, measure)
+    layout = solver.linear.layout(topology(scene))
+    found = _newton_step(unlock(scene), layout, x, slope, solver)
+    slope, step, adjoint, forces = (np.asarray(each) for each in (slope, *found))
     local = adjoint if way is None else adjoint - way.carry(adjoint)
-    return _Change(start + step, float(jnp.sum(slope * step)), -np.asarray(local * forces))
+    return _Change(float(value), x + step, float(np.sum(slope * step)), -local * forces)
 
 
 @compiled("solver")
@@ -242,5 +243,5 @@ def _newton_step(
 
 
 @partial(jax.jit, static_argnames="measure")
-def _slope(scene: Scene, x: jax.Array, measure: Measure) -> jax.Array:
-    return jax.grad(lambda x: measure(scene, x))(x)
+def _value_and_slope(scene: Scene, x: jax.Array, measure: Measure) -> tuple[jax.Array, jax.Array]:
+    return jax.value_and_grad(lambda x: measure(scene, x))(x)

@@ -88,7 +88,7 @@ def check_length(name: str, value: Numbers) -> None:
 
 
 def _checked_pairs(elements: Any, count: int) -> np.ndarray:
-    array = np.asarray(elements) if is_concrete(elements) else np.zeros(0)
+    array = np.asarray(elements if is_concrete(elements) else [0.0])
     if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != 2 or not len(array):
         raise ValueError(
             f"elements: expected concrete whole numbers of shape (m, 2), two nodes for each element, got shape "
@@ -144,7 +144,7 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     dtype = jnp.result_type(float) if dtype is None else dtype
     unit = np.linspace(-0.5, 0.5, nodes)[:, None] * [1.0, 0.0, 0.0]
     pairs = np.stack([np.arange(nodes - 1), np.arange(1, nodes)], axis=1)
-    return Line(unit.astype(dtype) * namespace(length).asarray(length, dtype), pairs, radian)
+    return Line(unit.astype(dtype) * namespace(length).asarray(length, dtype), pairs, to_device(radian, dtype))
 
 
 # -------------------------------------------------------------------------------------------- energy
@@ -417,11 +417,12 @@ def euler_bernoulli(
     """
     if np.shape(ratios) != (2,):
         raise ValueError(f"ratios: expected shape (2,), of the top and the bottom tendon, got {np.shape(ratios)}")
-    half, plane = 0.5 * jnp.asarray(length), jnp.asarray(young) / (1 - jnp.asarray(poisson) ** 2)
+    length, height = jnp.asarray(length), jnp.asarray(height)
+    half, plane = 0.5 * length, jnp.asarray(young) / (1 - jnp.asarray(poisson) ** 2)
     commanded = jnp.asarray(ratios) * half
     k = stiffness(jnp.asarray(tendon_modulus), commanded)
     # Tensions are k (a - l* + a rows . (eps, kappa)).
-    rows = jnp.stack([jnp.ones(2), jnp.asarray(height) * jnp.array([-0.5, 0.5])], axis=1)
+    rows = jnp.stack([jnp.ones(2), height * jnp.array([-0.5, 0.5])], axis=1)
     section = jnp.stack([plane * height, plane * height**3 / 12])
     matrix = jnp.diag(section) + half * (rows.T * k) @ rows
     stretch, curvature = jnp.linalg.solve(matrix, -rows.T @ (k * (half - commanded)))
