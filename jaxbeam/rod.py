@@ -181,7 +181,7 @@ def _element_energy(density: Callable[[jax.Array, Any], jax.Array], x: jax.Array
     length, (stretch, shear, curvature) = strains(x, params)
     fibres = stretch - 0.5 * params.height * jnp.asarray(_HEIGHTS, x.dtype) * curvature
     energies = jax.vmap(partial(fibre_energy, density), in_axes=(0, None))(fibres, params.material)
-    stiffness = SHEAR * shear_modulus(density, params.material)
+    stiffness = SHEAR * shear_modulus(density, params.material, x.dtype)
     along = 0.5 * jnp.sum(jnp.asarray(_WEIGHTS, x.dtype) * energies)
     return length * params.height * (along + 0.5 * stiffness * shear**2)
 
@@ -228,9 +228,9 @@ def _(
     return jax.jvp(lambda e, material: _plain(density, e, q, material), primals, tangents)
 
 
-def shear_modulus(density: Callable[[jax.Array, Any], jax.Array], material: Any) -> jax.Array:
+def shear_modulus(density: Callable[[jax.Array, Any], jax.Array], material: Any, dtype: Any) -> jax.Array:
     """`G`, the second derivative at rest of the density in a simple shear."""
-    zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(material)))
+    zero = jnp.zeros((), dtype)
     sheared = lambda g: density(jnp.stack([jnp.stack([zero, g]), jnp.stack([zero, zero])]), material)
     return jax.grad(jax.grad(sheared))(zero)
 

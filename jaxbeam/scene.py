@@ -167,7 +167,8 @@ def rod_beam(
     """The reference scene as a rod (see `jaxbeam.rod`): a cantilever with a tendon along half of each side.
 
     Args:
-        nodes: along the axis, odd, so that a middle one exists.
+        nodes: along the axis, odd, so that a middle one exists. Nine are within 0.5 % of the limit of many: at ratios
+            (0.8, 1.0) the tip turns by 10.31 degrees, in the limit by 10.35, by converged finite elements by 10.14.
         length: of the beam, positive.
         height: of the beam, positive.
         young: Young's modulus, scalar or one for each element.
