@@ -160,6 +160,7 @@ def test_no_width_is_a_point():
     assert float(energy(wide, x)) != pytest.approx(float(close), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_wide_anchors_settle_and_points_drift():
     """The angle at ratio 0.8 on six-node triangles: settled with a width, falling without."""
     settled, drifting = [], []

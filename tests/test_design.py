@@ -241,7 +241,7 @@ def bounded(beam):
 @pytest.mark.parametrize(
     ("optimiser", "steps", "most"),
     [
-        pytest.param(optax.adam(0.1), 400, 350, id="adam"),
+        pytest.param(optax.adam(0.1), 400, 350, id="adam", marks=pytest.mark.slow),
         pytest.param(optax.lbfgs(), 60, 30, id="lbfgs", marks=pytest.mark.slow),
     ],
 )

@@ -217,6 +217,7 @@ def test_mirrored_commands_bend_the_other_way(beam, turned):
     np.testing.assert_allclose(solution.x, turned[1][1].x * np.array([1, -1, -1]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_few_nodes_suffice(turned):
     """The default is within 0.5 % of the limit (10.349 degrees), of second order in the length of elements."""
     angles = [float(jb.tip_angle(*at)) for at in [(turned[1][0], turned[1][1].x)]]
@@ -273,6 +274,7 @@ def test_gradient_through_equilibrium():
         assert (np.asarray(slopes[name]) != 0).all()
 
 
+@pytest.mark.slow
 def test_sweep(beam, turned):
     rows = np.array([[row[0], 1.0] for row in FINITE_ELEMENTS])
     batch = jb.check(jb.sweep(beam, rows))
@@ -280,12 +282,14 @@ def test_sweep(beam, turned):
         np.testing.assert_allclose(x, solution.x, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_ramp(beam, turned):
     path = jb.check(jb.ramp(beam, [0.5, 1.0], steps=6))
     np.testing.assert_array_equal(path.x[0], beam.mesh.nodes)
     np.testing.assert_allclose(path.x[-1], turned[3][1].x, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_reach(beam):
     """Only the top tendon is pulled: the bottom one could help only by pushing, beyond its bound."""
     found = jb.reach(beam, 10.0)

@@ -100,6 +100,7 @@ def test_traced_sweep_equals_concrete(small):
     np.testing.assert_allclose(traced.x, jb.sweep(small, LINE).x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_dead_loads_are_applied(small):
     """At rest there is no load: the first lane of a chunk applies it, the others have it from the beginning."""
     load = jb.dead_load(small.mesh, small.tip, [0.0, -5.0])

@@ -58,6 +58,7 @@ def test_a_moment_bends_a_strip_to_a_circle():
     np.testing.assert_allclose(moved, [-1, 0], atol=strain**2 / 6)
 
 
+@pytest.mark.slow
 def test_euler_load():
     """The error falls as (H/L)^2: four times less where the column is twice as slender."""
     errors = [verification.critical_load(length, along=ALONG) - 1 for length in (10.0, 20.0)]
