@@ -11,6 +11,8 @@ with `x(s)` as the shape functions have it, so that it is a weighted mean of nod
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaxbeam._tree import is_concrete
@@ -36,28 +38,39 @@ def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
     if not is_concrete(mesh.nodes):
         raise ValueError("width: an anchor of finite width needs concrete nodes; build the mesh outside jit and grad")
     positions = np.asarray(mesh.nodes, float)
-    edges = surface(mesh)
     weights = {node: 0.0}
-    for edge_of, flip in (
-        ({edge[0]: edge for edge in edges.tolist()}, False),
-        ({edge[1]: edge for edge in edges.tolist()}, True),
-    ):
-        here, s = node, 0.0
-        while s < (1 - 1e-9) * width:
-            if here not in edge_of or (s > 0 and here == node):
-                problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
-                raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
-            first, second, *middle = edge_of[here]
-            line = [second, first, *middle] if flip else [first, second, *middle]
-            length = float(np.linalg.norm(positions[second] - positions[first]))
-            share = min(1.0, (width - s) / length)
-            xi = share * _POINTS
-            tent = 0.5 * share * length * (1 - (s + length * xi) / width)
-            for number, values in zip(line, _line_functions(len(line), xi), strict=True):
-                weights[number] = weights.get(number, 0.0) + float(tent @ values)
-            here, s = line[1], s + length
+    for line, s, length, share in walk(positions, surface(mesh), node, width):
+        xi = share * _POINTS
+        tent = 0.5 * share * length * (1 - (s + length * xi) / width)
+        for number, values in zip(line, _line_functions(len(line), xi), strict=True):
+            weights[number] = weights.get(number, 0.0) + float(tent @ values)
     nodes, values = np.array(list(weights)), np.array(list(weights.values()))
     return nodes, values / values.sum()
+
+
+def walk(
+    positions: np.ndarray, edges: np.ndarray, node: int, width: float
+) -> Iterator[tuple[list[int], float, float, float]]:
+    """The edges of a surface within `width` of a node, first one way round the body and then the other.
+
+    Yields:
+        The edge in the direction of the walk; the arc length at its beginning; its length; and the share of it, from
+        its beginning, that lies within `width`.
+
+    Raises:
+        ValueError: if the node is not a corner on the surface, or the surface closes on itself within `width`.
+    """
+    for ways in (edges, edges[:, [1, 0, 2][: edges.shape[1]]]):
+        following = {line[0]: line for line in ways.tolist()}
+        here, s = node, 0.0
+        while s < (1 - 1e-9) * width:
+            if here not in following or (s > 0 and here == node):
+                problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
+                raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
+            line = following[here]
+            length = float(np.linalg.norm(positions[line[1]] - positions[line[0]]))
+            yield line, s, length, min(1.0, (width - s) / length)
+            here, s = line[1], s + length
 
 
 def surface(mesh: Mesh) -> np.ndarray:

@@ -39,13 +39,9 @@ def rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
     points, weights = [], []
     for weight, single in _ORBITS[degree]:
         other = (1 - single) / 2
-        orbit = (
-            {tuple(single if i == k else other for i in range(3)) for k in range(3)}
-            if single != 1 / 3
-            else {(single,) * 3}
-        )
-        points += sorted(orbit, reverse=True)
-        weights += [weight] * len(orbit)
+        turns = 1 if single == 1 / 3 else 3
+        points += [[single if i == k else other for i in range(3)] for k in range(turns)]
+        weights += [weight] * turns
     return np.array(points), np.array(weights)
 
 

@@ -1,8 +1,7 @@
 """Triangle meshes: rest positions of the nodes and the triangles that join them.
 
 Triangles have three nodes (P1) or six (P2, see `jaxbeam.elements` for their order) and are counter-clockwise, lengths
-are in the user's unit. Everything is checked here, on the host,
-once; what follows trusts a `Mesh`.
+are in the user's unit. Everything is checked here, on the host, once; what follows trusts a `Mesh`.
 """
 
 from __future__ import annotations
@@ -95,12 +94,10 @@ def rectangle(
     """
     if order not in (1, 2):
         raise ValueError(f"order: expected 1 (triangles of three nodes) or 2 (of six), got {order!r}")
-    for name, count in (("nx", nx), ("ny", ny)):
-        if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 2:
-            raise ValueError(f"{name}: expected a whole number of at least 2, got {count!r}")
-    for name, extent in (("length", length), ("height", height)):
-        if is_concrete(extent) and not (np.ndim(extent) == 0 and np.isfinite(extent) and np.asarray(extent) > 0):
-            raise ValueError(f"{name}: expected a positive finite number, got {extent!r}")
+    check_count("nx", nx)
+    check_count("ny", ny)
+    check_length("length", length)
+    check_length("height", height)
     if diagonals not in ("one-sided", "mirrored", "crossed"):
         raise ValueError(f"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got {diagonals!r}")
     if diagonals == "mirrored" and ny % 2 == 0:
@@ -136,6 +133,18 @@ def rectangle(
     extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
     mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
     return quadratic(mesh) if order == 2 else mesh
+
+
+def check_length(name: str, value: Numbers) -> None:
+    """Refuse a concrete value that is not one positive finite number."""
+    if is_concrete(value) and not (np.ndim(value) == 0 and np.isfinite(value) and np.asarray(value) > 0):
+        raise ValueError(f"{name}: expected a positive finite number, got {value!r}")
+
+
+def check_count(name: str, count: int) -> None:
+    """Refuse what is not a whole number of at least 2."""
+    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 2:
+        raise ValueError(f"{name}: expected a whole number of at least 2, got {count!r}")
 
 
 def quadratic(mesh: Mesh) -> Mesh:

@@ -1,7 +1,7 @@
 """Newton's method for the unknown node positions of one scene, inside jit.
 
 A step takes the true Hessian whenever its Cholesky factor exists, and only where it does not one blended with
-the Hessian projected stencil by stencil: always projecting would make convergence linear. At a solution the
+a projected Hessian (`jaxbeam.projection`): always projecting would make convergence linear. At a solution the
 true factor exists if and only if the equilibrium is stable.
 
 The residual is relative: the largest unbalanced force on a free coordinate over the *force scale*, the largest

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxbeam._tree import Numbers
-from jaxbeam.anchors import surface
+from jaxbeam.anchors import surface, walk
 from jaxbeam.elements import EDGES, shape_functions
 from jaxbeam.scene import Scene, solid_terms, tendon_terms
 from jaxbeam.terms import TendonEnergy
@@ -91,21 +91,8 @@ def patches(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             anchors = [np.ravel(each) for each in (term.params.ends, term.params.width)]
             numbers = first + np.repeat(np.arange(len(term.nodes)), term.params.ends.shape[1])
             for node, width, number in zip(*anchors, numbers, strict=True):
-                for ways in (edges, edges[:, [1, 0, 2][: edges.shape[1]]]):
-                    found += [(*part, number) for part in _walk(rest, ways, int(node), float(width))]
+                found += [(line, share, number) for line, _, _, share in walk(rest, edges, int(node), float(width))]
         first += len(term.nodes)
     columns = zip(*found, strict=True) if found else ([], [], [])
     reached, shares, numbers = (np.array(column) for column in columns)
     return reached.astype(int).reshape(-1, edges.shape[1]), shares, numbers.astype(int)
-
-
-def _walk(rest: np.ndarray, edges: np.ndarray, node: int, width: float) -> list[tuple[list[int], float]]:
-    """The edges met from a node on within `width`, measured as `jaxbeam.anchors.patch` does, and the share of each."""
-    following = {edge[0]: edge for edge in edges.tolist()}
-    found, gone = [], 0.0
-    while gone < width:
-        edge = following[node]
-        length = float(np.linalg.norm(rest[edge[1]] - rest[edge[0]]))
-        found.append((edge, min(1.0, (width - gone) / length)))
-        node, gone = edge[1], gone + length
-    return found

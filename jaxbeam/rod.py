@@ -34,7 +34,7 @@ from jax import lax
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import macklin_mueller
-from jaxbeam.mesh import Mesh
+from jaxbeam.mesh import Mesh, check_count, check_length
 from jaxbeam.terms import TendonEnergy, Term, inverse_square_stiffness, polyline_length, tendons
 
 # Reissner's shear coefficient of a rectangular section.
@@ -79,12 +79,6 @@ class Line(Mesh):
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
         object.__setattr__(self, "radian", to_device(self.radian, nodes.dtype))
-
-
-def check_length(name: str, value: Numbers) -> None:
-    """Refuse a concrete value that is not one positive finite number."""
-    if is_concrete(value) and not (np.ndim(value) == 0 and np.isfinite(value) and np.asarray(value) > 0):
-        raise ValueError(f"{name}: expected a positive finite number, got {value!r}")
 
 
 def _checked_pairs(elements: Any, count: int) -> np.ndarray:
@@ -138,8 +132,7 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     Raises:
         ValueError: if `nodes` is not a whole number of at least 2, or a length is not positive and finite.
     """
-    if not isinstance(nodes, int | np.integer) or isinstance(nodes, bool) or nodes < 2:
-        raise ValueError(f"nodes: expected a whole number of at least 2, got {nodes!r}")
+    check_count("nodes", nodes)
     check_length("length", length)
     dtype = jnp.result_type(float) if dtype is None else dtype
     unit = np.linspace(-0.5, 0.5, nodes)[:, None] * [1.0, 0.0, 0.0]

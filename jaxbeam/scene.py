@@ -16,8 +16,8 @@ import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import Lame, lame, macklin_mueller
-from jaxbeam.mesh import Diagonals, Mesh, rectangle, with_middles
-from jaxbeam.rod import Line, RodEnergy, at_offsets, check_length, fibre_stretches, rod, rod_tendons, straight
+from jaxbeam.mesh import Diagonals, Mesh, check_length, rectangle, with_middles
+from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
 from jaxbeam.stencils import stencil_gradients, stencil_hessian
 from jaxbeam.terms import (
     SolidEnergy,
