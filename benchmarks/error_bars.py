@@ -22,8 +22,9 @@ import numpy as np
 
 import jaxbeam as jb
 from benchmarks import report
+from benchmarks.accuracy import FINEST
+from benchmarks.timing import medians
 
-FINEST = {"nx": 57, "ny": 13, "order": 2, "graded": True, "diagonals": "crossed"}
 MESHES: dict[str, dict[str, Any]] = {
     "P1 15 x 4": {"nx": 15, "ny": 4},
     "P1 29 x 7 crossed": {"nx": 29, "ny": 7, "diagonals": "crossed"},
@@ -119,12 +120,8 @@ def finest_rung(rung: int) -> float:
     scene = jb.command(jb.tendon_beam(7, 3, order=2, graded=True, anchor_width=0.25), [0.8, 1.0])
     for _ in range(rung):
         scene, _ = jb.enriched(scene)
-    times = []
-    for _ in range(4):
-        start = time.perf_counter()
-        jax.block_until_ready(jb.equilibrium(scene))
-        times.append(time.perf_counter() - start)
-    return float(np.median(times[1:]))
+    (timing,) = medians(lambda: jb.equilibrium(scene), repeats=3)
+    return timing.median
 
 
 def main() -> None:
