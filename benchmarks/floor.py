@@ -34,7 +34,7 @@ import jaxbeam as jb
 from benchmarks import reference, report, scaling
 from benchmarks.timing import medians
 from jaxbeam._tree import unlock
-from jaxbeam.linear import Layout, assemble
+from jaxbeam.linear import Layout, assemble, multiplications
 from jaxbeam.newton import topology
 from jaxbeam.scene import evaluate, stencil_hessians
 
@@ -55,15 +55,14 @@ def product_rates() -> list[tuple[int, float, float]]:
 
 
 def factor_operations(layout: Layout) -> float:
-    """Of a block-tridiagonal Cholesky: see `jaxbeam.BlockTridiagonal`."""
-    b, w, r = layout.blocks
-    return 2 * b * w * (7 / 3 * w**2 + 2 * w * r + r**2)
+    """Of a block-tridiagonal Cholesky: two for each multiplication."""
+    return 2 * multiplications(layout.blocks)
 
 
 def solve_operations(layout: Layout) -> float:
     """Of its two substitutions: half of each pivot, all of the blocks beside it and of the border, twice."""
-    b, w, r = layout.blocks
-    return 2 * 2 * b * w * (w / 2 + w + r)
+    b, w, head, tail, r = layout.blocks
+    return 2 * 2 * b * (w * w / 2 + head * tail + w * r)
 
 
 def counted(function: Callable[..., Any], *arguments: Any) -> float:
@@ -84,11 +83,11 @@ def factor_rates(rate: float, most: int) -> list[dict]:
         (timing,) = medians(solver.factor, repeats=int(np.clip(50_000 // problem.unknowns, 3, 31)))
         operations = factor_operations(solver.layout)
         reached = operations / timing.median
-        b, w, r = solver.layout.blocks
+        b, w, head, tail, r = solver.layout.blocks
         rows.append(
             {
                 "unknowns": problem.unknowns,
-                "blocks": f"{b} x {w} + {r}",
+                "blocks": f"{b} x {w}, {head} x {tail} + {r}",
                 "Mflop": operations / 1e6,
                 "ms": 1e3 * timing.median,
                 "Gflop/s": reached / 1e9,

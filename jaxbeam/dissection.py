@@ -26,12 +26,12 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import pytree, static_field, to_device
-from jaxbeam.linear import BlockTridiagonal, Topology, _blocks
+from jaxbeam.linear import BlockTridiagonal, Topology, chain_of, multiplications
 from jaxbeam.ordering import TILE, Couplings, Fronts, couplings, fronts, running
 
 # Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See
 # `choose_solver`.
-CROSSOVER = 1.2e9
+CROSSOVER = 0.6e9
 # Triangular tiles up to this size are inverted by LAPACK, larger ones by halves.
 SMALL = 16
 # Place of what a front below has not: past the end of the room for `S`, which is read as its last number, a zero.
@@ -472,22 +472,21 @@ def _device_layout(
 
 @lru_cache(maxsize=64)
 def choose_solver(topology: Topology) -> BlockTridiagonal | NestedDissection:
-    """The solver that is faster for a topology, by the work of the block-tridiagonal one.
+    """The solver that is faster for a topology, by the `multiplications` of the block-tridiagonal one.
 
     Factor and solve on one busy core, in milliseconds of processor time:
 
         beam         unknowns   work     BlockTridiagonal   NestedDissection
-        57 x 13      1,456      2e6      2.0                4.4
-        113 x 25     5,600      3e7      11.6               17
-        225 x 49     21,952     5e8      96                 64
+        57 x 13      1,456      1.6e6    2.0                4.4
+        113 x 25     5,600      2.3e7    11.6               17
+        225 x 49     21,952     3.5e8    96                 64
 
     Compilation takes about 1.5 s for the first and 3.5 s for the second, and the layout of the largest 0.1 and 0.7 s.
     At the crossover, about 35,000 unknowns of a beam, 20 steps repay that.
     """
-    fixed = topology.fixed.array
-    width = np.bincount(_blocks(topology), (~fixed).sum(axis=1)).max()
-    work = 7 / 3 * np.logical_not(fixed).sum() * width**2
-    return BlockTridiagonal() if work < CROSSOVER else NestedDissection()
+    chains = BlockTridiagonal()
+    work = multiplications(chain_of(topology, chains.joined).shape)
+    return chains if work < CROSSOVER else NestedDissection()
 
 
 @dataclasses.dataclass(frozen=True)

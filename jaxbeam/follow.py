@@ -157,9 +157,10 @@ def follow(
         # A target given up: where that is, as judged by the target's own forces.
         reached = trail.s[0] / jnp.where(target > 0, target, 1)
         entry = Report(state.x, jnp.append(numbers, jnp.where(walk.over, reached, 1)), counts)
-        here = jnp.arange(last + 1, dtype=jnp.int32)
-        write = jnp.where(walk.over, here >= walk.leg, landed & (here == walk.leg))
-        path = jax.tree.map(lambda all, new: jnp.where(write.reshape(-1, *[1] * new.ndim), new, all), walk.path, entry)
+        written = landed | walk.over
+        path = jax.tree.map(
+            lambda all, new: all.at[walk.leg].set(jnp.where(written, new, all[walk.leg])), walk.path, entry
+        )
         return Walk(
             leg=leg,
             trail=trail,
@@ -177,8 +178,11 @@ def follow(
         )
 
     walk = lax.while_loop(lambda walk: walk.running, attempt, walk)
+    # Where the walk ended before the last target, the targets after it are given up in the same state.
+    row = jnp.minimum(jnp.arange(last + 1), walk.leg)
+    path = jax.tree.map(lambda all: all[row], walk.path)
     ratios = jax.vmap(lambda s: ratios_of(scene_at(s)))(targets)
-    return _solutions(walk.path, ratios, solver), walk.factor, walk.trail
+    return _solutions(path, ratios, solver), walk.factor, walk.trail
 
 
 def _report(

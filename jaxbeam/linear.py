@@ -18,6 +18,7 @@ positive definite.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -39,7 +40,7 @@ class Layout:
         `s = k d`, row by row; entries that are fixed point past the end and are dropped.
     diagonal `(N,)`: places of the diagonal.
     empty `(size,)`: storage before assembly, as booleans: true on the diagonal of the padding.
-    blocks: number of blocks, their width and that of the border.
+    blocks: number of blocks, their width, how many rows and columns couple neighbours, and the width of the border.
     """
 
     slots: jax.Array
@@ -47,7 +48,7 @@ class Layout:
     scatter: tuple[jax.Array, ...]
     diagonal: jax.Array
     empty: jax.Array
-    blocks: tuple[int, int, int] = static_field()
+    blocks: tuple[int, int, int, int, int] = static_field()
 
 
 class LinearSolver(Protocol):
@@ -84,7 +85,12 @@ def assemble(layout: Layout, hessians: list[jax.Array]) -> jax.Array:
     """Storage of the sum of stencil Hessians `(k d, k d, m)`, one array for each term."""
     storage = layout.empty.astype(hessians[0].dtype)
     for places, hessian in zip(layout.scatter, hessians, strict=True):
-        storage = storage.at[places].add(hessian[np.tril_indices(len(hessian))], mode="drop")
+        # In a few parts, so that XLA computes the Hessians before the loop: fused with what reads them, each entry
+        # would be computed by itself.
+        parts = next(n for n in (3, 2, 1) if len(places) % n == 0)
+        rows, columns = (jnp.asarray(i.reshape(parts, -1)) for i in np.tril_indices(len(hessian)))
+        add = lambda all, part, h=hessian: (all.at[part[0]].add(h[part[1], part[2]], mode="drop"), None)
+        storage, _ = lax.scan(add, storage, (places.reshape(parts, -1, places.shape[1]), rows, columns))
     return storage
 
 
@@ -133,21 +139,19 @@ def _dense_layout(topology: Topology) -> Layout:
     size = slots.size
     position = np.full(fixed.size, size)
     position[slots] = np.arange(size)
-    scatter = []
-    for stencil in topology.stencils:
-        rows, columns = _stencil_pairs(position[_coordinates(stencil.array, topology)])
-        scatter.append(np.where(rows < size, rows * size + columns, size * size))
-    return _device_layout(
-        slots, position, scatter, np.arange(size) * (size + 1), np.zeros(size * size, bool), (1, size, 0)
-    )
+    diagonal = np.arange(size) * (size + 1)
+    return _layout(topology, slots, position, diagonal, size * size, (1, size, 0, 0, 0), lambda p, q: p * size + q)
 
 
 # --------------------------------------------------------------------------------- block tridiagonal
 
 
 class BorderedFactor(NamedTuple):
-    """`K = L L^T` by blocks: `pivot (b, w, w)` lower triangular diagonal blocks, `lower (b, w, w)` the blocks
-    left of them, `border (b, w, r)` the transposed rows of the border and `corner (r, r)` its own pivot."""
+    """`K = L L^T` by blocks: `pivot (b, w, w)` the transposes of its diagonal blocks, in which order LAPACK reads them,
+    `lower (b, head, tail)` the blocks left of them, `border (b, w, r)` the transposed rows of the border and
+    `corner (r, r)` its own pivot.
+
+    Only the last `tail` unknowns of a block are coupled to the next, and only to its first `head`."""
 
     pivot: jax.Array
     lower: jax.Array
@@ -159,28 +163,34 @@ class BorderedFactor(NamedTuple):
 class BlockTridiagonal:
     """Bordered block-tridiagonal Cholesky over the levels of the mesh.
 
-    `b` blocks of width `w` with `r` border columns take about `b w (7/3 w^2 + 2 w r + r^2)` multiplications,
-    and `2 b w^2` numbers of storage.
+    Each of `b` blocks has `w` unknowns, of which the first `head` are coupled to the last `tail` of the block before;
+    with a border of `r` columns a factor holds `b (w^2 + head tail + w r)` numbers. For its time see `multiplications`.
+
+    joined: several levels of the mesh may make a block of up to this many unknowns. Fewer and wider blocks take more
+        arithmetic and less time, while they are small.
     """
 
+    joined: int = 32
+
     def layout(self, topology: Topology) -> Layout:
-        return _bordered_layout(topology)
+        return _bordered_layout(topology, self.joined)
 
     def factor(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
-        w, r = layout.blocks[1:]
+        w, _, tail, r = layout.blocks[1:]
         diagonal, lower, border, corner = _pieces(layout, storage)
 
         def eliminate(carry: Any, block: Any) -> Any:
             pivot, above, schur = carry
             diagonal, lower, border = block
-            lower = lax.linalg.triangular_solve(pivot, lower, left_side=False, lower=True, transpose_a=True)
-            pivot = jnp.linalg.cholesky(diagonal - lower @ lower.T, symmetrize_input=False)
+            lower = lax.linalg.triangular_solve(pivot.T, lower.T, left_side=True, lower=True).T
+            pivot = jnp.linalg.cholesky(diagonal - _first(lower @ lower.T, w, w), symmetrize_input=False).T
             if r:
-                border = lax.linalg.triangular_solve(pivot, border - lower @ above, left_side=True, lower=True)
+                border = border - _first(lower @ above, w, r)
+                border = lax.linalg.triangular_solve(pivot.T, border, left_side=True, lower=True)
                 schur = schur - border.T @ border
-            return (pivot, border, schur), (pivot, lower, border)
+            return (pivot[w - tail :, w - tail :], border[w - tail :], schur), (pivot, lower, border)
 
-        start = (jnp.eye(w, dtype=storage.dtype), jnp.zeros((w, r), storage.dtype), corner)
+        start = (jnp.eye(tail, dtype=storage.dtype), jnp.zeros((tail, r), storage.dtype), corner)
         (_, _, schur), (pivot, lower, border) = lax.scan(eliminate, start, (diagonal, lower, border))
         corner = jnp.linalg.cholesky(schur, symmetrize_input=False) if r else schur
         # A failed block is NaN, and so is everything after it.
@@ -188,33 +198,34 @@ class BlockTridiagonal:
         return BorderedFactor(pivot, lower, border, corner), ok
 
     def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
-        b, w, r = layout.blocks
+        b, w, head, tail, r = layout.blocks
         # Right-hand sides are rows here, so that the products below can be plain loops.
         k = rhs.size // len(rhs)
         inner, outer = rhs[: b * w].reshape(b, w, k).swapaxes(1, 2), rhs[b * w :].reshape(r, k)
         solve = lambda pivot, y, transpose: (
-            lax.linalg.triangular_solve(pivot, y.T, left_side=True, lower=True, transpose_a=transpose).T
+            lax.linalg.triangular_solve(pivot.T, y.T, left_side=True, lower=True, transpose_a=transpose).T
         )
 
         def forward(above: jax.Array, block: Any) -> Any:
             pivot, lower, right = block
-            y = solve(pivot, right - _times(above, lower.T), False)
-            return y, y
+            y = solve(pivot, right - _first(_times(above, lower.T), k, w), False)
+            return y[:, w - tail :], y
 
-        start = jnp.zeros((k, w), rhs.dtype)
-        _, inner = lax.scan(forward, start, (factor.pivot, factor.lower, inner))
+        _, inner = lax.scan(forward, jnp.zeros((k, tail), rhs.dtype), (factor.pivot, factor.lower, inner))
         if r:
             outer = outer - jnp.einsum("bwr,bkw->rk", factor.border, inner)
             outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True)
             outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True, transpose_a=True)
             inner = inner - jnp.einsum("bwr,rk->bkw", factor.border, outer)
 
-        def backward(carry: jax.Array, block: Any) -> Any:
+        def backward(below: jax.Array, block: Any) -> Any:
             pivot, lower, right = block
-            y = solve(pivot, right - carry, True)
-            return _times(y, lower), y
+            y = solve(pivot, right - jnp.pad(below, ((0, 0), (w - tail, 0))), True)
+            return _times(y[:, :head], lower), y
 
-        _, inner = lax.scan(backward, start, (factor.pivot, factor.lower, inner), reverse=True)
+        _, inner = lax.scan(
+            backward, jnp.zeros((k, tail), rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True
+        )
         return jnp.concatenate([inner.swapaxes(1, 2).reshape(b * w, k), outer]).reshape(rhs.shape)
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
@@ -222,52 +233,58 @@ class BlockTridiagonal:
 
         The inertia of the matrix is the sum of its pivots' (Haynsworth 1968).
         """
-        w, r = layout.blocks[1:]
+        w, _, tail, r = layout.blocks[1:]
         diagonal, lower, border, corner = _pieces(layout, storage)
 
         def eliminate(carry: Any, block: Any) -> Any:
             above, border_above, schur, count = carry
             diagonal, lower, border = block
             ahead = lower @ above
-            inverse, negative = _inverse(_mirrored(diagonal) - ahead @ lower.T)
-            border = border - ahead @ border_above
+            inverse, negative = _inverse(_mirrored(diagonal) - _first(ahead[:, w - tail :] @ lower.T, w, w))
+            border = border - _first(ahead @ border_above, w, r)
             schur = schur - border.T @ inverse @ border
-            return (inverse, border, schur, count + negative), (inverse, border)
+            return (inverse[w - tail :], border, schur, count + negative), (inverse, border)
 
         zeros = jnp.zeros((w, w + r), storage.dtype)
-        carry = (zeros[:, :w], zeros[:, w:], _mirrored(corner), jnp.zeros((), jnp.int32))
+        carry = (zeros[:tail, :w], zeros[:, w:], _mirrored(corner), jnp.zeros((), jnp.int32))
         (_, _, schur, count), (inverse, border) = lax.scan(eliminate, carry, (diagonal, lower, border))
         corner, negative = _inverse(schur)
         return BorderedFactor(inverse, lower, border, corner), count + negative
 
     def solve_indefinite(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
-        b, w, _ = layout.blocks
+        b, w, head, tail, _ = layout.blocks
         inner, outer = rhs[: b * w].reshape(b, w), rhs[b * w :]
 
         def forward(above: jax.Array, block: Any) -> Any:
             inverse, lower, right = block
-            y = right - lower @ above
-            return inverse @ y, y
+            y = right - jnp.pad(lower @ above, (0, w - head))
+            return (inverse @ y)[w - tail :], y
 
-        _, inner = lax.scan(forward, jnp.zeros(w, rhs.dtype), (factor.pivot, factor.lower, inner))
+        _, inner = lax.scan(forward, jnp.zeros(tail, rhs.dtype), (factor.pivot, factor.lower, inner))
         outer = outer - jnp.einsum("bwr,bwv,bv->r", factor.border, factor.pivot, inner)
         outer = factor.corner @ outer
         inner = inner - factor.border @ outer
 
-        def backward(carry: jax.Array, block: Any) -> Any:
+        def backward(below: jax.Array, block: Any) -> Any:
             inverse, lower, right = block
-            y = inverse @ (right - carry)
-            return lower.T @ y, y
+            y = inverse @ (right - jnp.pad(below, (w - tail, 0)))
+            return lower.T @ y[:head], y
 
-        _, inner = lax.scan(backward, jnp.zeros(w, rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True)
+        _, inner = lax.scan(backward, jnp.zeros(tail, rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True)
         return jnp.concatenate([inner.reshape(b * w), outer])
 
 
 def _pieces(layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Diagonal and lower blocks `(b, w, w)`, border `(b, w, r)` and corner `(r, r)` of a stored matrix."""
-    b, w, r = layout.blocks
-    diagonal, lower, border, corner = jnp.split(storage, np.cumsum([b * w * w, b * w * w, b * w * r]))
-    return diagonal.reshape(b, w, w), lower.reshape(b, w, w), border.reshape(b, w, r), corner.reshape(r, r)
+    """Diagonal blocks `(b, w, w)` and those below `(b, head, tail)`, border `(b, w, r)` and corner `(r, r)` of a matrix
+    as it is stored."""
+    b, w, head, tail, r = layout.blocks
+    diagonal, lower, border, corner = jnp.split(storage, np.cumsum([b * w * w, b * head * tail, b * w * r]))
+    return diagonal.reshape(b, w, w), lower.reshape(b, head, tail), border.reshape(b, w, r), corner.reshape(r, r)
+
+
+def _first(part: jax.Array, rows: int, columns: int) -> jax.Array:
+    """A matrix `(rows, columns)` of which `part` is the first corner, and the rest zero."""
+    return jnp.pad(part, ((0, rows - part.shape[0]), (0, columns - part.shape[1])))
 
 
 # Up to this width a loop is faster than a call of a matrix product.
@@ -293,61 +310,75 @@ def _inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @lru_cache(maxsize=32)
-def _bordered_layout(topology: Topology) -> Layout:
+def _bordered_layout(topology: Topology, joined: int) -> Layout:
     fixed = topology.fixed.array
     count, d = fixed.shape
-    free = np.logical_not(fixed.all(axis=1))
-    block = _blocks(topology)
-    border_nodes = _border(topology, block)
-    on_border = np.zeros(count, bool)
-    on_border[border_nodes] = True
-    inner = free & ~on_border
-
-    coordinate_block = np.repeat(np.where(inner, block, -1), d)
-    coordinate_block[fixed.ravel()] = -1
-    order = np.argsort(coordinate_block, kind="stable")
-    order = order[coordinate_block[order] >= 0]
-    owner = coordinate_block[order]
-    starts = np.searchsorted(owner, np.arange(owner.max() + 1)) if owner.size else np.zeros(1, int)
-    within = np.arange(owner.size) - starts[owner]
-    b, w = (int(owner.max()) + 1, int(within.max()) + 1) if owner.size else (1, 1)
-    outer = np.flatnonzero(np.repeat(on_border, d) & ~fixed.ravel())
-    r = outer.size
-
-    size = b * w + r
-    slots = np.full(size, count * d)
-    slots[owner * w + within] = order
-    slots[b * w :] = outer
+    chain = chain_of(topology, joined)
+    (b, w, head, tail, r), slots = chain.shape, chain.slots
+    size, taken = slots.size, slots < count * d
     position = np.full(count * d, size)
-    used = slots < count * d
-    position[slots[used]] = np.flatnonzero(used)
+    position[slots[taken]] = np.flatnonzero(taken)
 
-    total = 2 * b * w * w + b * w * r + r * r
-    lower_at, border_at, corner_at = b * w * w, 2 * b * w * w, 2 * b * w * w + b * w * r
-    scatter = []
-    for stencil in topology.stencils:
-        p, q = _stencil_pairs(position[_coordinates(stencil.array, topology)])
+    lower_at = b * w * w
+    border_at = lower_at + b * head * tail
+    corner_at = border_at + b * w * r
+
+    def place(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         bp, bq, sp, sq = p // w, q // w, p % w, q % w
         inside = p < b * w
-        if (inside & (bp - bq > 1)).any():
-            raise AssertionError("a stencil couples blocks that are not neighbours")
-        place = np.where(bp == bq, 0, lower_at) + (bp * w + sp) * w + sq
-        place = np.where(inside, place, border_at + q * r + (p - b * w))
-        place = np.where(q < b * w, place, corner_at + (p - b * w) * r + (q - b * w))
-        scatter.append(np.where(p < size, place, total))
-    inner_slot = np.arange(b * w)
-    diagonal = np.concatenate([inner_slot * w + inner_slot % w, corner_at + np.arange(r) * (r + 1)])
-    empty = np.zeros(total, bool)
-    empty[diagonal[~used]] = True
-    return _device_layout(slots, position, scatter, diagonal, empty, (b, w, r))
+        coupled = inside & (bp > bq)
+        if (coupled & ((bp - bq > 1) | (sp >= head) | (sq < w - tail))).any():
+            raise AssertionError("a stencil couples unknowns that are not neighbours")
+        at = np.where(coupled, lower_at + (bp * head + sp) * tail + sq - (w - tail), (bp * w + sp) * w + sq)
+        at = np.where(inside, at, border_at + q * r + (p - b * w))
+        return np.where(q < b * w, at, corner_at + (p - b * w) * r + (q - b * w))
+
+    inner = np.arange(b * w)
+    diagonal = np.concatenate([inner * w + inner % w, corner_at + np.arange(r) * (r + 1)])
+    return _layout(topology, slots, position, diagonal, corner_at + r * r, chain.shape, place)
+
+
+# Parts of a block, in the order of its unknowns: coupled to the block before, to none, to both, to the one after.
+BEFORE, NEITHER, BOTH, AFTER = range(4)
+
+
+class Chain(NamedTuple):
+    """Unknowns in a chain of blocks, of which only neighbours are coupled, but for those on the border; the fields are
+    those of `Layout`, `shape` its `blocks`."""
+
+    slots: np.ndarray
+    shape: tuple[int, int, int, int, int]
+
+
+# What a block costs whatever its width, in multiplications: calls of LAPACK and the steps of a loop. Measured.
+PER_BLOCK = 40_000
+
+
+def multiplications(shape: tuple[int, int, int, int, int]) -> float:
+    """What a factorisation by blocks of this shape (`Layout.blocks`) takes: a Cholesky of each block, a triangular
+    solve and a product for each coupling, and as much for the border."""
+    b, w, head, tail, r = shape
+    border = r * (w * w / 2 + head * tail + w * r)
+    return b * (w**3 / 6 + head * tail**2 / 2 + head**2 * tail + border) + r**3 / 6
 
 
 @lru_cache(maxsize=32)
-def _blocks(topology: Topology) -> np.ndarray:
-    """Block of each node: breadth-first levels, narrow neighbours merged. The cheapest of a few roots."""
+def chain_of(topology: Topology, joined: int) -> Chain:
+    """The chain of blocks that costs least: breadth-first levels from one of a few roots, joined to several a block."""
+    weight = (~topology.fixed.array).sum(axis=1)
+    best = min(
+        _level_structures(topology), key=lambda level: (level.max() + 1.0) * np.bincount(level, weight).max() ** 3
+    )
+    widest = int(np.bincount(best, weight).max())
+    limits = {widest, *range(2 * widest, joined + 1, widest)}
+    chains = [_chain(topology, _joined(best, weight, limit)) for limit in limits]
+    return min(chains, key=lambda chain: multiplications(chain.shape) + PER_BLOCK * chain.shape[0])
+
+
+def _level_structures(topology: Topology) -> list[np.ndarray]:
+    """Breadth-first level of each node, from a few roots."""
     fixed = topology.fixed.array
     neighbours = _adjacency(fixed.shape[0], topology.elements.array)
-    weight = (~fixed).sum(axis=1)
     roots: list[np.ndarray] = []
     held = np.flatnonzero(fixed.any(axis=1))
     if held.size:
@@ -356,25 +387,59 @@ def _blocks(topology: Topology) -> np.ndarray:
     far = _levels(np.array([0]), neighbours)
     end = _levels(np.flatnonzero(far == far.max())[:1], neighbours)
     roots += [np.flatnonzero(end == end.max())[:1], np.flatnonzero(end == end.max())]
-    best, best_cost = np.zeros(0, int), np.inf
-    for root in roots:
-        block = _merge(_levels(root, neighbours), weight)
-        width = np.bincount(block, weight).max()
-        cost = (block.max() + 1) * width**3
-        if cost < best_cost:
-            best, best_cost = block, cost
-    return best
+    return [_levels(root, neighbours) for root in roots]
 
 
-def _merge(level: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Join neighbouring levels while they fit the width of the widest, so that less is padding."""
+def _joined(level: np.ndarray, weight: np.ndarray, limit: float) -> np.ndarray:
+    """Block of each node: neighbouring levels joined while they fit the limit."""
     widths = np.bincount(level, weight)
-    limit, block, filled = widths.max(), np.zeros(len(widths), int), 0.0
+    block, filled = np.zeros(len(widths), int), 0.0
     for k, width in enumerate(widths):
         fits = filled + width <= limit
         block[k] = (block[k - 1] if k else 0) + (0 if fits else 1)
         filled = filled + width if fits else width
     return block[level]
+
+
+def _chain(topology: Topology, block: np.ndarray) -> Chain:
+    """The chain of these blocks: what has to go to the border, and what of a block is coupled to its neighbours."""
+    free = np.logical_not(topology.fixed.array)
+    inner: np.ndarray = free.any(axis=1)
+    border = _border(topology, block)
+    inner[border] = False
+    # Blocks without an unknown are none.
+    _, numbered = np.unique(block[inner], return_inverse=True)
+    block = np.full(inner.size, -1)
+    block[inner] = numbered
+    before, after = np.zeros_like(inner), np.zeros_like(inner)
+    for stencil in topology.stencils:
+        nodes, there = stencil.array, inner[stencil.array]
+        low = np.where(there, block[nodes], inner.size).min(axis=1, keepdims=True)
+        high = block[nodes].max(axis=1, keepdims=True)
+        coupled = there & (high > low)
+        after[nodes[coupled & (block[nodes] == low)]] = True
+        before[nodes[coupled & (block[nodes] == high)]] = True
+    part = np.where(before, np.where(after, BOTH, BEFORE), np.where(after, AFTER, NEITHER))
+
+    unknown, outer = (free & inner[:, None]).ravel(), np.zeros_like(free)
+    outer[border] = free[border]
+    used = np.flatnonzero(unknown)
+    owner, part = (np.repeat(of_node, free.shape[1])[used] for of_node in (block, part))
+    order = np.lexsort((used, part, owner))
+    used, owner, part = used[order], owner[order], part[order]
+    b = int(owner.max(initial=0)) + 1
+    amount = np.bincount(owner, minlength=b)
+    w = max(int(amount.max()), 1)
+    # Padding comes before those that are coupled to the next block.
+    within = np.arange(used.size) - np.repeat(np.cumsum(amount) - amount, amount)
+    within = np.where(part >= BOTH, within + w - amount[owner], within)
+    head = int(within[(part == BEFORE) | (part == BOTH)].max(initial=-1)) + 1
+    tail = w - int(within[part >= BOTH].min(initial=w))
+    r = int(outer.sum())
+    slots = np.full(b * w + r, free.size)
+    slots[owner * w + within] = used
+    slots[b * w :] = np.flatnonzero(outer)
+    return Chain(slots, (b, w, head, tail, r))
 
 
 def _adjacency(count: int, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -454,18 +519,27 @@ def _stencil_pairs(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(a, b), np.minimum(a, b)
 
 
-def _device_layout(
+def _layout(
+    topology: Topology,
     slots: np.ndarray,
     position: np.ndarray,
-    scatter: list[np.ndarray],
     diagonal: np.ndarray,
-    empty: np.ndarray,
-    blocks: tuple[int, int, int],
+    total: int,
+    blocks: tuple[int, int, int, int, int],
+    place: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> Layout:
-    if empty.size >= 2**31 - 1:
+    """The layout of a storage of `total` numbers, in which row `p` and column `q <= p` have this `place`."""
+    if total >= 2**31 - 1:
         raise ValueError(
-            f"mesh: its factor would hold {empty.size} numbers, more than 32-bit indices address; use a coarser mesh"
+            f"mesh: its factor would hold {total} numbers, more than 32-bit indices address; use a coarser mesh"
         )
+    places = []
+    for stencil in topology.stencils:
+        p, q = _stencil_pairs(position[_coordinates(stencil.array, topology)])
+        places.append(np.where(p < slots.size, place(p, q), total))
+    empty = np.zeros(total, bool)
+    empty[diagonal[slots == position.size]] = True
     index = lambda a: to_device(a, np.int32)
-    places = tuple(index(s.T) for s in scatter)
-    return Layout(index(slots), index(position), places, index(diagonal), to_device(empty), blocks)
+    return Layout(
+        index(slots), index(position), tuple(index(p.T) for p in places), index(diagonal), to_device(empty), blocks
+    )

@@ -18,19 +18,17 @@ from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, 
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, check_length, rectangle, with_middles
 from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
-from jaxbeam.stencils import stencil_gradients, stencil_hessian
+from jaxbeam.stencils import admissible_step, stencil_gradients, stencil_hessian, volume_ratios
 from jaxbeam.terms import (
     SolidEnergy,
     TendonEnergy,
     Term,
-    admissible_step,
     check_nodes,
     dead_load_energy,
     forbids_inversion,
     inverse_square_stiffness,
     solid,
     tendons,
-    volume_ratios,
 )
 
 
@@ -349,7 +347,7 @@ def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The smallest `J` `()` over the solids, or stretch of a fibre of the rods, and the number `()` of its element (-1
     in a scene without either)."""
-    ratios = [jnp.min(jax.vmap(volume_ratios)(x[t.nodes], t.params), axis=1) for t in solid_terms(scene)]
+    ratios = [jnp.min(volume_ratios(x[t.nodes], t.params), axis=0) for t in solid_terms(scene)]
     ratios += [jnp.min(jax.vmap(fibre_stretches)(x[t.nodes], t.params), axis=1) for t in rod_terms(scene)]
     if not ratios:
         return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
@@ -373,6 +371,5 @@ def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.
     for term in solid_terms(scene):
         assert isinstance(term.energy, SolidEnergy)
         bound = 0.0 if forbids_inversion(term.energy, term.params) else RELEASED
-        limit = jax.vmap(admissible_step, in_axes=(0, 0, 0, None, None))
-        limits.append(jnp.min(limit(x[term.nodes], dx[term.nodes], term.params, keep, bound)))
+        limits.append(jnp.min(admissible_step(x[term.nodes], dx[term.nodes], term.params, keep, bound)))
     return jnp.min(jnp.stack(limits))

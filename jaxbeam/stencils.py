@@ -12,8 +12,8 @@ loops of it, more than ten times as fast as derivatives by six coordinates.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import jax
@@ -31,7 +31,7 @@ def stencil_gradients(term: Term, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     gradients, weights, (density, *stress) = _at_points(_value_and_stress, term.energy, positions, term.params)
     first = weights * jnp.stack(stress).reshape(2, 2, *weights.shape)
     forces = gradients[:, 0, None] * first[None, :, 0] + gradients[:, 1, None] * first[None, :, 1]
-    return jnp.sum(weights * density, axis=0), jnp.moveaxis(jnp.sum(forces, axis=-2), -1, 0)
+    return _over_points(weights * density), jnp.moveaxis(_over_points(forces), -1, 0)
 
 
 def stencil_hessian(term: Term, x: jax.Array, convex: bool = False) -> jax.Array:
@@ -54,7 +54,7 @@ def stencil_hessian(term: Term, x: jax.Array, convex: bool = False) -> jax.Array
     left, right = gradients[:, :, None, None, None], gradients[None, None, :, None]
     half = left[:, 0] * second[None, :, 0] + left[:, 1] * second[None, :, 1]
     whole = half[:, :, None, :, 0] * right[:, :, :, :, 0] + half[:, :, None, :, 1] * right[:, :, :, :, 1]
-    return jnp.sum(whole, axis=-2).reshape(k * d, k * d, m)
+    return _over_points(whole).reshape(k * d, k * d, m)
 
 
 def _at_points(
@@ -62,15 +62,58 @@ def _at_points(
 ) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
     """Shape-function gradients `(k, 2, q, m)`, weights `(q, m)`, and a derivative of the density at each point."""
     gradients = jnp.transpose(params.gradients, (2, 3, 1, 0))
-    moved = jnp.moveaxis(x - params.rest, 0, -1)
-    H = jnp.sum(moved[:, :, None, None] * gradients[:, None], axis=0)
+    H = _interpolated(gradients, x - params.rest)
     components = [H[i, k] for i in range(2) for k in range(2)]
     of_one = lambda H, material: derivative(energy.density, H, material)
     each = jax.vmap(jax.vmap(of_one), in_axes=(0, None))(components, params.material)
     return gradients, params.weights.T, each
 
 
-@lru_cache(maxsize=64)
+def _interpolated(gradients: jax.Array, field: jax.Array) -> jax.Array:
+    """Gradient `(2, 2, q, m)` of a field `(m, k, 2)`, from those of the shape functions `(k, 2, q, m)`."""
+    nodes = zip(jnp.moveaxis(field, 0, -1), gradients, strict=True)
+    return functools.reduce(jnp.add, (values[:, None, None] * slopes for values, slopes in nodes))
+
+
+def _over_points(values: jax.Array) -> jax.Array:
+    """The sum over quadrature points of `(..., q, m)`. Written out: XLA's own takes several times as long."""
+    return functools.reduce(jnp.add, (values[..., q, :] for q in range(values.shape[-2])))
+
+
+def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
+    """`J = det F` `(q, m)` of elements at positions `x` `(m, k, 2)`."""
+    H = _interpolated(jnp.transpose(params.gradients, (2, 3, 1, 0)), x - params.rest)
+    return 1 + H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+
+
+def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: float, bound: float = 0.0) -> jax.Array:
+    """Largest `t` `(m,)` for which no point of an element falls below `keep` times its present `J` on `x + t dx`.
+
+    In the plane `J(t) = J + b t + c t^2` with `b = cof F : dH`, `c = det dH`, so the first crossing is the
+    root of a quadratic, taken in the form that does not cancel. Infinite where `J` never falls so far, and
+    where `J` is at or under `bound` already.
+
+    Args:
+        x: `(m, k, 2)` positions of the nodes of each element.
+        dx: `(m, k, 2)` the step.
+        params: of the elements.
+        keep: fraction of `J`.
+        bound: a `J`.
+    """
+    gradients = jnp.transpose(params.gradients, (2, 3, 1, 0))
+    H, D = _interpolated(gradients, x - params.rest), _interpolated(gradients, dx)
+    F00, F11 = 1 + H[0, 0], 1 + H[1, 1]
+    j = F00 * F11 - H[0, 1] * H[1, 0]
+    b = F11 * D[0, 0] + F00 * D[1, 1] - H[1, 0] * D[0, 1] - H[0, 1] * D[1, 0]
+    c = D[0, 0] * D[1, 1] - D[0, 1] * D[1, 0]
+    gap = (1 - keep) * j
+    discriminant = b**2 - 4 * c * gap
+    denominator = jnp.sqrt(jnp.maximum(discriminant, 0)) - b
+    crosses = (j > bound) & (discriminant >= 0) & (denominator > 0)
+    return jnp.min(jnp.where(crosses, 2 * gap / jnp.where(crosses, denominator, 1), jnp.inf), axis=0)
+
+
+@functools.lru_cache(maxsize=64)
 def _of_components(density: Callable[[jax.Array, Any], jax.Array]) -> Callable[[list[jax.Array], Any], jax.Array]:
     """The density as a function of the four components of `H`. Jitted, so that it is traced once for all of its
     derivatives."""

@@ -102,31 +102,6 @@ def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
     return jnp.einsum("ki,qkj->qij", x - params.rest, params.gradients)
 
 
-def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
-    """`J = det F` `(q,)` of one element at its quadrature points."""
-    H = displacement_gradients(x, params)
-    return 1 + H[:, 0, 0] + H[:, 1, 1] + (H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] * H[:, 1, 0])
-
-
-def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: float, bound: float = 0.0) -> jax.Array:
-    """Largest `t` for which no point of one element falls below `keep` times its present `J` on `x + t dx`.
-
-    In the plane `J(t) = J + b t + c t^2` with `b = cof F : dH`, `c = det dH`, so the first crossing is the
-    root of a quadratic, taken in the form that does not cancel. Infinite where `J` never falls so far, and
-    where `J` is at or under `bound` already.
-    """
-    F = displacement_gradients(x, params) + jnp.eye(2, dtype=x.dtype)
-    D = jnp.einsum("ki,qkj->qij", dx, params.gradients)
-    j = F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
-    b = F[:, 1, 1] * D[:, 0, 0] + F[:, 0, 0] * D[:, 1, 1] - F[:, 1, 0] * D[:, 0, 1] - F[:, 0, 1] * D[:, 1, 0]
-    c = D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0]
-    gap = (1 - keep) * j
-    discriminant = b**2 - 4 * c * gap
-    denominator = jnp.sqrt(jnp.maximum(discriminant, 0)) - b
-    crosses = (j > bound) & (discriminant >= 0) & (denominator > 0)
-    return jnp.min(jnp.where(crosses, 2 * gap / jnp.where(crosses, denominator, 1), jnp.inf))
-
-
 def solid(
     mesh: Mesh,
     params: Any,

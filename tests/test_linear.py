@@ -105,7 +105,10 @@ CASES = {
     "annulus, held on one side": (annulus(14, 4), [[0, 28, 42]], "left"),
     "two pieces and a tendon": (TWO_PIECES, [[4, 20]], "both ends"),
     "two triangles": (jb.rectangle(1.0, 1.0, 2, 2), [[0, 3]], "left"),
+    "six nodes": (jb.rectangle(2.0, 1.0, 7, 3, order=2), [[1, 19]], "left"),
 }
+# Each level of these small meshes a block, as in large ones; and several, as it is by default.
+LEVELS = jb.BlockTridiagonal(joined=0)
 
 
 def structure_of(name):
@@ -145,8 +148,12 @@ def solve(solver, layout, hessians, field, shifts):
 @pytest.mark.parametrize("name", CASES)
 def test_solution_and_definiteness(name):
     """The solution is NumPy's; the factor exists if and only if the least eigenvalue is positive."""
-    structure, hessians, free, matrix = case(name)
-    check_solver(jb.BlockTridiagonal(), structure, hessians, free, matrix)
+    check_solver(LEVELS, *case(name))
+
+
+@pytest.mark.parametrize("name", ["several far and crossing", "L", "six nodes"])
+def test_solution_with_joined_levels(name):
+    check_solver(jb.BlockTridiagonal(), *case(name))
 
 
 @pytest.mark.parametrize("name", ["no tendon", "guides over many levels", "two triangles"])
@@ -173,13 +180,15 @@ def check_solver(solver, structure, hessians, free, matrix):
     assert np.asarray(definite).tolist() == [True, True, False, False, False]
 
 
+@pytest.mark.parametrize("solver", [LEVELS, jb.BlockTridiagonal()])
 @pytest.mark.parametrize("name", CASES)
-def test_layout_holds_every_unknown_once(name):
+def test_layout_holds_every_unknown_once(name, solver):
     structure = structure_of(name)
-    layout = jb.BlockTridiagonal().layout(structure)
+    layout = solver.layout(structure)
     slots, position = np.asarray(layout.slots), np.asarray(layout.position)
     free = np.flatnonzero(~structure.fixed.array.ravel())
-    b, w, r = layout.blocks
+    b, w, head, tail, r = layout.blocks
+    assert max(head, tail) <= w
     assert slots.size == b * w + r
     assert sorted(slots[slots < structure.fixed.array.size].tolist()) == free.tolist()
     np.testing.assert_array_equal(slots[position[free]], free)
@@ -191,17 +200,19 @@ def test_layout_holds_every_unknown_once(name):
 
 
 def blocks(name):
-    layout = jb.BlockTridiagonal().layout(structure_of(name))
+    layout = LEVELS.layout(structure_of(name))
     return layout, layout.blocks
 
 
 def test_cases_reach_what_they_are_for():
     """There is a border with far tendons only, padding where levels differ in width, and more than one block."""
-    assert blocks("no tendon")[1] == (8, 6, 0)
-    assert blocks("both ends free, far apart")[1][2] == 2  # one end of it, two coordinates
-    assert blocks("guides over many levels")[1][2] >= 6
-    assert blocks("both ends clamped")[1][2] == 2
-    layout, (b, w, _) = blocks("L")
+    assert blocks("no tendon")[1] == (8, 6, 6, 6, 0)
+    assert blocks("both ends free, far apart")[1][-1] == 2  # one end of it, two coordinates
+    assert blocks("guides over many levels")[1][-1] >= 6
+    assert blocks("both ends clamped")[1][-1] == 2
+    assert blocks("six nodes")[1][:4] == (6, 20, 20, 10)  # a column of corners is coupled to the next two columns
+    assert jb.BlockTridiagonal().layout(structure_of("no tendon")).blocks == (2, 24, 6, 6, 0)
+    layout, (b, w, *_) = blocks("L")
     assert b > 2
     padding = np.asarray(layout.slots) == 2 * len(l_shape().nodes)
     assert 0 < padding.sum() < b * w
@@ -209,15 +220,15 @@ def test_cases_reach_what_they_are_for():
 
 
 def test_reference_beam_has_narrow_blocks(beam):
-    """Numbered along the short side: 28 blocks of 14, and no border, as each tendon has a clamped end."""
-    assert jb.BlockTridiagonal().layout(topology(beam)).blocks == (28, 14, 0)
+    """Numbered along the short side: 14 blocks of two levels of 14, and no border, as each tendon has a clamped end."""
+    assert jb.BlockTridiagonal().layout(topology(beam)).blocks == (14, 28, 14, 14, 0)
 
 
 def test_bad_numbering_costs_nothing(beam):
     mesh, _ = shuffled(beam.mesh)
     elements = Key(mesh.elements)
     structure = Topology(elements, Key(supports(mesh, "left")), (elements,))
-    assert jb.BlockTridiagonal().layout(structure).blocks == (28, 14, 0)
+    assert jb.BlockTridiagonal().layout(structure).blocks == (14, 28, 14, 14, 0)
 
 
 def test_layout_is_computed_once_for_equal_structure(beam):
