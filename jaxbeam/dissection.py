@@ -94,6 +94,10 @@ class NestedDissection:
         factor, bad = _factor(layout, storage, True)
         return factor, bad == 0
 
+    def pivots(self, layout: DissectionLayout, factor: Factor) -> jax.Array:
+        # Pivot tiles are stored inverted, where the stiffness was.
+        return factor.tiles[layout.place[layout.diagonal]] ** -2
+
     def solve(self, layout: DissectionLayout, factor: Factor, rhs: jax.Array) -> jax.Array:
         return _solve(layout, factor, rhs)
 
@@ -498,6 +502,9 @@ class Automatic:
 
     def factor(self, layout: Any, storage: jax.Array) -> tuple[Any, jax.Array]:
         return _made(layout).factor(layout, storage)
+
+    def pivots(self, layout: Any, factor: Any) -> jax.Array:
+        return _made(layout).pivots(layout, factor)
 
     def solve(self, layout: Any, factor: Any, rhs: jax.Array) -> jax.Array:
         return _made(layout).solve(layout, factor, rhs)

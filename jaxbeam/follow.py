@@ -179,7 +179,7 @@ def follow(
 
     walk = lax.while_loop(lambda walk: walk.running, attempt, walk)
     # Where the walk ended before the last target, the targets after it are given up in the same state.
-    row = jnp.minimum(jnp.arange(last + 1), walk.leg)
+    row = jnp.minimum(jnp.arange(last + 1, dtype=jnp.int32), walk.leg)
     path = jax.tree.map(lambda all: all[row], walk.path)
     ratios = jax.vmap(lambda s: ratios_of(scene_at(s)))(targets)
     return _solutions(path, ratios, solver), walk.factor, walk.trail

@@ -62,6 +62,10 @@ class LinearSolver(Protocol):
         """Factor, and whether the matrix is positive definite to working precision."""
         ...
 
+    def pivots(self, layout: Layout, factor: Any) -> jax.Array:
+        """What was left of each diagonal entry `(N,)` when its turn came to be eliminated."""
+        ...
+
     def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array:
         """Solution for `rhs` `(N,)`, or for each column of one `(N, k)`."""
         ...
@@ -118,6 +122,9 @@ class Dense:
         size = layout.blocks[1]
         factor = jnp.linalg.cholesky(storage.reshape(size, size), symmetrize_input=False)
         return factor, jnp.isfinite(factor[-1, -1])
+
+    def pivots(self, layout: Layout, factor: jax.Array) -> jax.Array:
+        return jnp.diagonal(factor) ** 2
 
     def solve(self, layout: Layout, factor: jax.Array, rhs: jax.Array) -> jax.Array:
         half = lax.linalg.triangular_solve(factor, rhs.reshape(len(rhs), -1), left_side=True, lower=True)
@@ -196,6 +203,10 @@ class BlockTridiagonal:
         # A failed block is NaN, and so is everything after it.
         ok = jnp.isfinite(corner[-1, -1]) if r else jnp.isfinite(pivot[-1, -1, -1])
         return BorderedFactor(pivot, lower, border, corner), ok
+
+    def pivots(self, layout: Layout, factor: BorderedFactor) -> jax.Array:
+        inner = jnp.diagonal(factor.pivot, axis1=1, axis2=2).ravel()
+        return jnp.concatenate([inner, jnp.diagonal(factor.corner)]) ** 2
 
     def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
         b, w, head, tail, r = layout.blocks

@@ -321,6 +321,7 @@ def test_ramp_step_by_step():
     close(by_end, by_command * np.linspace(0, 1, len(ROWS))[:, None])
 
 
+@pytest.mark.slow
 def test_sweep_lane_by_lane():
     for lane in range(len(ROWS)):
         (by_theta, by_rows), batch = sweep_slopes(THETA, jnp.array(ROWS), jnp.eye(len(ROWS))[lane], True)
@@ -354,6 +355,7 @@ def scalar_angle(scalars):
     return jb.tip_angle(scene, solution.x), solution
 
 
+@pytest.mark.slow
 def test_scalars_outside_jit():
     """One Young's modulus, Poisson's ratio and tendon modulus for all."""
     scalars = {"young": 1e4, "poisson": 0.4, "modulus": 2e3}
@@ -439,6 +441,7 @@ def test_closed_form():
     np.testing.assert_allclose(at["hessian"], jit(jax.hessian(apex))(TAUT), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_compositions():
     """The other orders in which to differentiate twice, and one in which to do so thrice, against the closed form."""
 

@@ -22,6 +22,7 @@ from helpers import (
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
+from jaxbeam.dissection import NestedDissection
 from jaxbeam.linear import Topology, assemble, expand, gather
 from jaxbeam.newton import topology
 from jaxbeam.projection import project_each, project_many
@@ -159,6 +160,16 @@ def test_solution_with_joined_levels(name):
 @pytest.mark.parametrize("name", ["no tendon", "guides over many levels", "two triangles"])
 def test_dense_is_the_same_interface(name):
     check_solver(jb.Dense(), *case(name))
+
+
+@pytest.mark.parametrize("solver", [LEVELS, jb.Dense(), NestedDissection()])
+def test_pivots_multiply_to_the_determinant(solver):
+    structure, hessians, _, matrix = case("several far and crossing")
+    layout = solver.layout(structure)
+    factor, _ = solver.factor(layout, assemble(layout, [jnp.asarray(h) for h in hessians]))
+    pivots = np.asarray(solver.pivots(layout, factor))
+    assert pivots.shape == layout.slots.shape
+    np.testing.assert_allclose(np.sum(np.log(pivots)), np.linalg.slogdet(matrix)[1], rtol=1e-12)
 
 
 def check_solver(solver, structure, hessians, free, matrix):

@@ -261,6 +261,7 @@ def angle_of(values):
     return jb.tip_angle(scene, jb.equilibrium(scene).x)
 
 
+@pytest.mark.slow
 def test_gradient_through_equilibrium():
     """In every real argument, against central differences."""
     values = {"length": 3.5, "height": 0.8, "young": 1e4, "poisson": 0.45, "tendon_modulus": 2e3}

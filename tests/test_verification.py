@@ -66,7 +66,8 @@ def test_euler_load():
     np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.05)
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_orders_of_convergence(order):
     """In L2 one more than the degree, in the energy norm the degree."""
     # It compiles in half the time of what would be chosen for a square.
@@ -76,7 +77,7 @@ def test_orders_of_convergence(order):
     np.testing.assert_allclose(observed, verification.ORDERS[order], atol=0.1)
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("ratios", verification.PEER_RATIOS)
 def test_scikit_fem_finds_the_same(order, ratios):
     """Eight digits of the tip angle, and of all positions and lengths relative to the beam."""
