@@ -14,10 +14,11 @@ import pytest
 
 # Nearly all of the time here is compilation. XLA's older emitters take half of it and run as fast, but a later version
 # may not know them; without LLVM's optimisation it is a third less again. Benchmarks verify what is optimised.
-flags = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
+os.environ["XLA_FLAGS"] = (
+    f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 if jax.__version_info__ < (0, 11):
-    flags.append("--xla_cpu_use_fusion_emitters=false")
-os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
+    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 
 import jaxbeam as jb
 
