@@ -31,7 +31,7 @@ from jaxbeam.ordering import TILE, Couplings, Fronts, couplings, fronts, running
 
 # Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See
 # `choose_solver`.
-CROSSOVER = 0.6e9
+CROSSOVER = 0.3e9
 # Triangular tiles up to this size are inverted by LAPACK, larger ones by halves.
 SMALL = 16
 # Place of what a front below has not: past the end of the room for `S`, which is read as its last number, a zero.
@@ -478,15 +478,15 @@ def _device_layout(
 def choose_solver(topology: Topology) -> BlockTridiagonal | NestedDissection:
     """The solver that is faster for a topology, by the `multiplications` of the block-tridiagonal one.
 
-    Factor and solve on one busy core, in milliseconds of processor time:
+    Assembly, factor and solve on one core, in milliseconds (`python -m benchmarks.scaling`):
 
-        beam         unknowns   work     BlockTridiagonal   NestedDissection
-        57 x 13      1,456      1.6e6    2.0                4.4
-        113 x 25     5,600      2.3e7    11.6               17
-        225 x 49     21,952     3.5e8    96                 64
+        beam         unknowns   multiplications   BlockTridiagonal   NestedDissection
+        57 x 13      1,456      1.6e6             1.9                3.3
+        113 x 25     5,600      2.3e7             12                 14
+        225 x 49     21,952     3.5e8             137                69
 
-    Compilation takes about 1.5 s for the first and 3.5 s for the second, and the layout of the largest 0.1 and 0.7 s.
-    At the crossover, about 35,000 unknowns of a beam, 20 steps repay that.
+    Compilation takes about 1.1 s for the first and 2.4 s for the second, and the layout of the largest 0.1 and 0.3 s.
+    At the crossover, about 20,000 unknowns of a beam, 20 steps repay that.
     """
     chains = BlockTridiagonal()
     work = multiplications(chain_of(topology, chains.joined).shape)
