@@ -12,10 +12,11 @@ with `x(s)` as the shape functions have it, so that it is a weighted mean of nod
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
-from jaxbeam._tree import is_concrete
+from jaxbeam._tree import Key, is_concrete, read_only
 from jaxbeam.elements import EDGES
 from jaxbeam.mesh import Mesh
 
@@ -76,11 +77,17 @@ def walk(
 def surface(mesh: Mesh) -> np.ndarray:
     """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
     body, and the node between them if there is one."""
-    triangles = mesh.elements
+    return _surface(Key(mesh.elements))
+
+
+@lru_cache(maxsize=32)
+def _surface(elements: Key) -> np.ndarray:
+    triangles = elements.array
     sides = [[triangles[:, a], triangles[:, b], *triangles.T[3 + k :][:1]] for k, (a, b) in enumerate(EDGES)]
     every = np.stack([np.stack(side, axis=1) for side in sides], axis=1).reshape(-1, 2 + (triangles.shape[1] == 6))
-    _, number, count = np.unique(np.sort(every[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True)
-    return every[count[number.ravel()] == 1]
+    low, high = np.sort(every[:, :2].astype(np.int64), axis=1).T
+    _, number, count = np.unique(low * (triangles.max() + 1) + high, return_inverse=True, return_counts=True)
+    return read_only(every[count[number] == 1])
 
 
 def _line_functions(nodes: int, xi: np.ndarray) -> list[np.ndarray]:

@@ -53,6 +53,7 @@ class Walk(NamedTuple):
 
     leg: jax.Array  # index of the target walked to
     trail: Trail
+    kept: jax.Array  # positions of that equilibrium as they were solved for, where `trail` has it a step ahead
     trial: jax.Array  # parameter tried next
     start: jax.Array  # positions it starts from, and the way ahead of them
     way: jax.Array
@@ -97,6 +98,7 @@ def follow(
     walk = Walk(
         leg=count,
         trail=trail,
+        kept=rest,
         trial=targets[0],
         start=rest if x is None else x,
         way=jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0) if way is None else way,
@@ -139,6 +141,7 @@ def follow(
         # for: a polynomial continued from there does not blow up what was left unbalanced.
         settled = state.x + jnp.where(known & (correction(state.x, state.step) <= INACCURATE), state.step, 0)
         trail = choose(good, extend(trail, walk.trial, settled, state.aside, walk.way, known), trail)
+        kept = jnp.where(good, state.x, walk.kept)
         cut = jnp.where(saddle, walk.increment, 0.5 * (walk.trial - trail.s[0]))
         # A target reached at once invites to walk straight to the next one.
         easy = landed & ((attempts == 1) | (walk.increment <= 0))
@@ -164,8 +167,9 @@ def follow(
         return Walk(
             leg=leg,
             trail=trail,
+            kept=kept,
             trial=trial,
-            start=jnp.where(leave, state.x, trail.x[0]),
+            start=jnp.where(leave, state.x, jnp.where(over, kept, trail.x[0])),
             way=way,
             factor=state.factor,
             increment=increment,
