@@ -34,7 +34,8 @@ import jaxbeam as jb
 from benchmarks import reference, report, scaling
 from benchmarks.timing import medians
 from jaxbeam._tree import unlock
-from jaxbeam.linear import Layout, assemble, multiplications
+from jaxbeam.chain import multiplications
+from jaxbeam.linear import Layout, assemble
 from jaxbeam.newton import topology
 from jaxbeam.scene import evaluate, stencil_hessians
 

@@ -26,7 +26,8 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import pytree, static_field, to_device
-from jaxbeam.linear import BlockTridiagonal, Topology, chain_of, multiplications
+from jaxbeam.chain import Topology, chain_of, multiplications
+from jaxbeam.linear import BlockTridiagonal
 from jaxbeam.ordering import TILE, Couplings, Fronts, couplings, fronts, running
 
 # Work of the block-tridiagonal solver, in multiplications, above which nested dissection is faster. See

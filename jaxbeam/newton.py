@@ -21,8 +21,9 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import Key, blank, choose
+from jaxbeam.chain import Topology
 from jaxbeam.dissection import Automatic
-from jaxbeam.linear import Layout, LinearSolver, Topology, assemble, expand, gather
+from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
 
 

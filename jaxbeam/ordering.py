@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbeam.linear import Topology, _levels
+from jaxbeam.chain import Topology, breadth_first_levels
 
 # Rows of a tile. Microseconds to subtract a product of tiles, to invert a tile, to add to one what a front below passes
 # on, and that a front costs besides (one core of a Xeon of 2023). A second, larger size for large fronts gains a tenth
@@ -196,7 +196,7 @@ def _dissect(topology: Topology, leaf: int) -> tuple[np.ndarray, np.ndarray, int
 def _embed(n: int, i: np.ndarray, j: np.ndarray, pivots: int = 10) -> np.ndarray:
     """Coordinates `(n, pivots)` of the nodes of a graph: distances to a few far nodes (Harel and Koren 2002)."""
     start = np.searchsorted(i, np.arange(n + 1))
-    distances = lambda root: _levels(np.array([root]), (start, j))
+    distances = lambda root: breadth_first_levels(np.array([root]), (start, j))
     root = int(distances(0).argmax())
     nearest = np.full(n, n + 1)
     columns = []

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import lambertw
 
 import jaxbeam as jb
-from jaxbeam.linear import Topology
+from jaxbeam.chain import Topology
 
 EPS = np.finfo(np.float64).eps
 

@@ -11,9 +11,10 @@ from test_linear import CASES, case, check_solver, structure_of
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
+from jaxbeam.chain import Topology
 from jaxbeam.dissection import NestedDissection, choose_solver
 from jaxbeam.equilibrium import topology
-from jaxbeam.linear import Topology, assemble, expand, gather
+from jaxbeam.linear import assemble, expand, gather
 
 # Leaves of few unknowns that are not joined again, so that small meshes have trees of several levels.
 SMALL = NestedDissection(leaf=8, join=False)

@@ -22,8 +22,9 @@ from helpers import (
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
+from jaxbeam.chain import Topology
 from jaxbeam.dissection import NestedDissection
-from jaxbeam.linear import Topology, assemble, expand, gather
+from jaxbeam.linear import assemble, expand, gather
 from jaxbeam.newton import topology
 from jaxbeam.projection import project_each, project_many
 from jaxbeam.scene import stencil_hessians

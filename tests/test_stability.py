@@ -10,7 +10,8 @@ from helpers import assembled, random_scene, shuffled, spring_pair, supports
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
-from jaxbeam.linear import Topology, assemble, expand, gather
+from jaxbeam.chain import Topology
+from jaxbeam.linear import assemble, expand, gather
 from jaxbeam.newton import topology
 from jaxbeam.scene import stencil_hessians
 
