@@ -158,13 +158,15 @@ def errors(setting: Setting, poisson: float, truth: np.ndarray, repeats: int) ->
     return rows
 
 
-def hand(poisson: float, truth: np.ndarray) -> list[dict[str, Any]]:
+def hand(poisson: float, truth: np.ndarray, repeats: int) -> list[dict[str, Any]]:
     """The hand calculation."""
     rows = []
     for ratio, exact in zip(RATIOS, truth, strict=True):
-        found = jb.euler_bernoulli([ratio, 1.0], poisson=poisson)
+        calculate = partial(jb.euler_bernoulli, [ratio, 1.0], poisson=poisson)
+        found = calculate()
+        (timing,) = medians(calculate, repeats=repeats)
         off = 100 * (np.array([found.tip_angle, found.tensions[0], found.lengths[0]]) / exact - 1)
-        row = {"setting": "by hand", "poisson": poisson, "ratio": ratio, "status": 0, "ms": 0.01}
+        row = {"setting": "by hand", "poisson": poisson, "ratio": ratio, "status": 0, "ms": 1e3 * timing.median}
         rows.append(row | {"angle": off[0], "tension": off[1], "length": off[2]})
     return rows
 
@@ -259,9 +261,10 @@ def main() -> None:
         floors[poisson] = float(np.abs(100 * gap / truth)[:, :2].max() / 3)
         print(f"nu = {poisson}: angle, tension, length at {RATIOS}:\n{np.round(truth, 5)}")
         print(f"error of this reference, a third of its distance from half the fineness: {floors[poisson]:.4f} %\n")
-        found = hand(poisson, truth)
+        repeats = 3 if options.quick else 7
+        found = hand(poisson, truth, repeats)
         for setting in settings(options.quick):
-            found += errors(setting, poisson, truth, 3 if options.quick else 7)
+            found += errors(setting, poisson, truth, repeats)
         print_rows(found, poisson)
         rows += found
         print("The cheapest setting for an error of angle and tension, over all ratios:\n")

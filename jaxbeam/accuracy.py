@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxbeam._tree import compiled, is_concrete, replace, unlock
 from jaxbeam.anchors import surface
-from jaxbeam.elements import DEGREES, rule
+from jaxbeam.elements import degree_of
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
 from jaxbeam.mesh import Finer, Mesh, cut_in_four, with_middle_nodes
@@ -157,9 +157,7 @@ def _on(mesh: Mesh, term: Term, parts: int) -> Term:
     """A term on the finer mesh, where each element has become `parts`."""
     if isinstance(term.energy, SolidEnergy):
         material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), parts, axis=0), term.params.material)
-        points = term.params.weights.shape[1]
-        degree = next(d for d in DEGREES if len(rule(d)[1]) == points)
-        return solid(mesh, material, term.energy.density, max(degree, 2))
+        return solid(mesh, material, term.energy.density, max(degree_of(term.params.weights.shape[1]), 2))
     if isinstance(term.energy, TendonEnergy) and term.params.width is not None:
         params = term.params
         same = tendons(mesh, params.ends, params.modulus, term.energy.stiffness, np.asarray(params.width))

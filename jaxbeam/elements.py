@@ -45,6 +45,20 @@ def rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points), np.array(weights)
 
 
+def degree_of(points: int) -> int:
+    """The degree of the rule with so many points.
+
+    Raises:
+        ValueError: if there is none here.
+    """
+    degrees = {len(rule(degree)[1]): degree for degree in DEGREES}
+    if points not in degrees:
+        raise ValueError(
+            f"scene: expected a solid with {sorted(degrees)} quadrature points in an element, got {points}"
+        )
+    return degrees[points]
+
+
 def shape_functions(nodes: int, points: np.ndarray) -> np.ndarray:
     """Values `(q, k)` of the `k` shape functions at barycentric points `(q, 3)`."""
     if nodes == 3:

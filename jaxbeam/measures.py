@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.elements import DEGREES, EDGES, rule
+from jaxbeam.elements import EDGES, degree_of, rule
 from jaxbeam.rod import Line, RodEnergy
 from jaxbeam.scene import Scene, solid_terms, tendon_terms
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
@@ -147,10 +147,7 @@ def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
     """The matrix `(k, q)` from values at `q` quadrature points to those of the linear field that fits them best, at
     the `k` nodes of the element. Fewer than three points do not fix a linear field: of those that fit the least is
     taken, which for one point is constant."""
-    rules = {len(shares): (places, shares) for places, shares in map(rule, DEGREES)}
-    if points not in rules:
-        raise ValueError(f"scene: expected a solid with {sorted(rules)} quadrature points in an element, got {points}")
-    places, shares = rules[points]
+    places, shares = rule(degree_of(points))
     root = np.sqrt(shares)
     at_corners = np.linalg.pinv(root[:, None] * places) * root
     between = [(at_corners[a] + at_corners[b]) / 2 for a, b in EDGES]

@@ -217,8 +217,8 @@ def factorise(
     of the true Hessian; and whether round-off decided that: it is so after a shift by no more, which is tried first, or
     a pivot is no more. One that is not `finite` is tried once.
     """
-    stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
-    round_off = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5 * stiffness
+    diagonal = storage[layout.diagonal]
+    stiffness, noise = jnp.max(jnp.abs(diagonal)), float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
 
     def project_all(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would be computed
@@ -234,15 +234,18 @@ def factorise(
         count = tries.astype(storage.dtype)
         share = jnp.where(tries > 1, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 2)), 0.0)
         more = jnp.where(share < 1, 0.0, 10.0 ** (count - 18)) * stiffness
-        blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(jnp.where(tries == 1, round_off, more))
+        blend = (
+            ((1 - share) * storage + share * convex)
+            .at[layout.diagonal]
+            .add(jnp.where(tries == 1, noise * stiffness, more))
+        )
         factor, done = solver.linear.factor(layout, blend)
         return tries + 1, factor, done, convex
 
     begin = (jnp.zeros((), jnp.int32), no_factor(layout, storage.dtype, solver), ~finite, jnp.zeros_like(storage))
     going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] <= MAX_BLENDS + 1))
     tries, factor, done, _ = lax.while_loop(going, attempt, begin)
-    least = jnp.min(solver.linear.pivots(layout, factor) / storage[layout.diagonal])
-    blunt = least <= PIVOT_ROUND_OFF * float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
+    blunt = jnp.min(solver.linear.pivots(layout, factor) / diagonal) <= PIVOT_ROUND_OFF * noise
     return factor, done & (tries == 1), done & ((tries == 2) | ((tries == 1) & blunt))
 
 

@@ -123,7 +123,7 @@ def tendon_beam(
         anchor_width: of the patches that the free ends of the tendons pull on, see `tendons`. At 0 they pull on single
             nodes, whose answer drifts as the mesh is refined: for a pull on the top to 0.8, six-node triangles give
             9.77, 9.68, 9.46 degrees on 15 x 5, 29 x 7 and 57 x 13 corners, and 10.14 on each with a width of 0.25.
-        graded: crowd nodes where the clamp meets the faces, see `rectangle`.
+        graded: crowd nodes at the clamp, the faces and the middle, where the tendons end; see `rectangle`.
         diagonals: see `rectangle`.
         density: the material, see `jaxbeam.materials`.
         stiffness: the law of the tendons, see `tendons`.

@@ -61,12 +61,17 @@ def _at_points(
     derivative: Callable[..., list[jax.Array]], energy: SolidEnergy, x: jax.Array, params: SolidParams
 ) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
     """Shape-function gradients `(k, 2, q, m)`, weights `(q, m)`, and a derivative of the density at each point."""
-    gradients = jnp.transpose(params.gradients, (2, 3, 1, 0))
+    gradients = _shape_gradients(params)
     H = _interpolated(gradients, x - params.rest)
     components = [H[i, k] for i in range(2) for k in range(2)]
     of_one = lambda H, material: derivative(energy.density, H, material)
     each = jax.vmap(jax.vmap(of_one), in_axes=(0, None))(components, params.material)
     return gradients, params.weights.T, each
+
+
+def _shape_gradients(params: SolidParams) -> jax.Array:
+    """Gradients `(k, 2, q, m)` of the shape functions, with elements last."""
+    return jnp.transpose(params.gradients, (2, 3, 1, 0))
 
 
 def _interpolated(gradients: jax.Array, field: jax.Array) -> jax.Array:
@@ -82,7 +87,7 @@ def _over_points(values: jax.Array) -> jax.Array:
 
 def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
     """`J = det F` `(q, m)` of elements at positions `x` `(m, k, 2)`."""
-    H = _interpolated(jnp.transpose(params.gradients, (2, 3, 1, 0)), x - params.rest)
+    H = _interpolated(_shape_gradients(params), x - params.rest)
     return 1 + H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
 
 
@@ -100,7 +105,7 @@ def admissible_step(x: jax.Array, dx: jax.Array, params: SolidParams, keep: floa
         keep: fraction of `J`.
         bound: a `J`.
     """
-    gradients = jnp.transpose(params.gradients, (2, 3, 1, 0))
+    gradients = _shape_gradients(params)
     H, D = _interpolated(gradients, x - params.rest), _interpolated(gradients, dx)
     F00, F11 = 1 + H[0, 0], 1 + H[1, 1]
     j = F00 * F11 - H[0, 1] * H[1, 0]
