@@ -26,6 +26,7 @@ from typing import Any, TypeAlias, TypeVar, dataclass_transform
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
@@ -149,6 +150,23 @@ def blank(function: Callable[..., Any], *arguments: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
 
 
+def once(wanted: jax.Array | bool, compute: Callable[..., T], otherwise: T, *arguments: Any) -> T:
+    """`compute(*arguments)` where that is `wanted`, and where it is not `otherwise`, at no cost.
+
+    A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would always
+    pay. What it computes must depend on the arguments alone.
+    """
+    if isinstance(wanted, bool):
+        return compute(*arguments) if wanted else otherwise
+
+    def turn(carry: tuple[T, jax.Array]) -> tuple[T, jax.Array]:
+        # Tied to the loop's state: XLA moves what does not change out of a loop, and it would be computed always.
+        _, tied = lax.optimization_barrier((carry, arguments))
+        return compute(*tied), jnp.zeros((), bool)
+
+    return lax.while_loop(lambda carry: carry[1], turn, (otherwise, wanted))[0]
+
+
 def choose(condition: jax.Array, yes: T, no: T) -> T:
     """One of two trees of the same structure, by a traced `()` boolean."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
@@ -176,8 +194,13 @@ def to_device(values: Any, dtype: Any = None) -> jax.Array:
         return jax.device_put(np.asarray(values, dtype))
 
 
-# XLA's newer CPU emitters take twice as long to compile the solver's many small kernels, which run no faster for it.
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if (0, 10) <= jax.__version_info__ < (0, 11) else None
+# What makes XLA compile the solver's many small kernels in less than half the time, and they run no slower: its older
+# emitters, and no passes that search its loops for what there is not: anything to move out of them, or to drop. The
+# last one would split each sum in two, for a round-off that the line search is far above.
+_PASSES = "while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
+_QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": _PASSES}
+# A later version may not know them.
+COMPILER_OPTIONS = _QUICKLY if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
 def _outside() -> bool:

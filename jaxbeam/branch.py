@@ -21,7 +21,7 @@ from jax import lax
 from jaxbeam._tree import Numbers, unlock
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
-from jaxbeam.newton import Newton, force_scale, topology
+from jaxbeam.newton import Newton, force_scale, stiffest, topology
 from jaxbeam.scene import Scene, command, evaluate, smallest_jacobian, stencil_hessians
 from jaxbeam.solution import check
 from jaxbeam.stability import lowest_mode
@@ -212,7 +212,7 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
         factor, negative = solver.linear.factor_indefinite(layout, storage)
         gradient = gather(layout, at.gradient)
         solve = lambda v: expand(layout, -solver.linear.solve_indefinite(layout, factor, v), x.shape)
-        residual = jnp.max(jnp.abs(gradient)) / force_scale(layout, storage, x, at, rtol)
+        residual = jnp.max(jnp.abs(gradient)) / force_scale(stiffest(layout, storage), x, at, rtol)
         return solve(gradient), solve(gather(layout, rate)), residual, negative
 
     def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:

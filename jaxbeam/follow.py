@@ -121,12 +121,15 @@ def follow(
         # What gives the tangent of the branch; at a saddle its soft modes, which the factor there filters out of noise.
         probe = lambda x, definite: jnp.where(definite, rate(x), noise)
         free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
-        state = newton(scene, layout, walk.start, walk.way, jnp.where(walk.over, 0, budget), free, probe, solver)
+        passing = walk.trial < targets[-1] if last else None
+        budget = jnp.where(walk.over, 0, budget)
+        state = newton(scene, layout, walk.start, walk.way, budget, free, passing, probe, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
         steps, attempts, status = counts[0], counts[3], counts[-1]
 
         converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
-        saddle = converged & ~state.definite & ~state.marginal & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
+        unstable = (status & Status.UNSTABLE) != 0
+        saddle = converged & unstable & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
         spent_out = (steps >= solver.max_steps) | (attempts >= MAX_ATTEMPTS) | ~sound
         may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > trail.s[0]) & ~spent_out
         # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
@@ -136,7 +139,7 @@ def follow(
         failed = ~good & ~saddle
         over = (~landed & spent_out) | (failed & ~may_cut)
 
-        known = state.definite & jnp.all(jnp.isfinite(state.aside))
+        known = state.stiffness.definite & jnp.all(jnp.isfinite(state.aside))
         # The step that is not taken any more still tells where the branch lies, to twice as many digits as `rtol` asks
         # for: a polynomial continued from there does not blow up what was left unbalanced.
         settled = state.x + jnp.where(known & (correction(state.x, state.step) <= INACCURATE), state.step, 0)
@@ -171,7 +174,7 @@ def follow(
             trial=trial,
             start=jnp.where(leave, state.x, jnp.where(over, kept, trail.x[0])),
             way=way,
-            factor=state.factor,
+            factor=state.stiffness.factor,
             increment=increment,
             cuts=jnp.where(landed & (status == 0), 0, walk.cuts + failed.astype(jnp.int32)),
             escapes=jnp.where(good, 0, walk.escapes + saddle.astype(jnp.int32)),
@@ -204,8 +207,8 @@ def _report(
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
         Status.INVERTED: ~(volume > 0),
-        Status.UNSTABLE: converged & ~state.definite & ~state.marginal,
-        Status.INACCURATE: converged & (state.marginal | (state.definite & (left > INACCURATE))),
+        Status.UNSTABLE: converged & ~state.stiffness.definite & ~state.stiffness.marginal,
+        Status.INACCURATE: converged & (state.stiffness.marginal | (state.stiffness.definite & (left > INACCURATE))),
         Status.INVALID: ~sound,
     }
     flags, up = jnp.array([int(flag) for flag in raised], jnp.int32), jnp.stack(list(raised.values()))

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Key, blank, choose
+from jaxbeam._tree import Key, blank, choose, once
 from jaxbeam.chain import Topology
 from jaxbeam.dissection import Automatic
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
@@ -78,6 +78,9 @@ PIVOT_ROUND_OFF = 2.0
 FIRST_SHARE = 0.01
 MAX_BLENDS = 16
 
+# A step no longer than this, over the size of the body, leaves the stiffness as good as it was: what it changes of
+# the softest mode is as small a share.
+NEAR = 1e-6
 # A correction that makes an answer inaccurate, and how many steps are spent on a smaller one.
 INACCURATE = 1e-3
 POLISH = 10
@@ -92,19 +95,29 @@ def topology(scene: Scene) -> Topology:
 STEPS, PROJECTED, HALVINGS, POLISHED = range(4)
 
 
+class Stiffness(NamedTuple):
+    """The Hessian, as far as it is kept.
+
+    `factor` is that of the true one if `definite`, else of one made so; `marginal` if round-off decided which of the
+    two, which leaves its sign open. `largest` `()` is the largest entry of its diagonal.
+    """
+
+    factor: Any
+    definite: jax.Array
+    marginal: jax.Array
+    largest: jax.Array
+
+
 class State(NamedTuple):
     """Where Newton's method stands.
 
-    `factor` is that of the Hessian at `x`: of the true one if `definite`, else of one made so; `marginal` if round-off
-    decided which of the two, which leaves its sign open. `step` `(n, 2)` is the step to take next and
-    `aside` `(n, 2)` how `x` would move under the probe.
+    `stiffness` is that at `x`. `step` `(n, 2)` is the step to take next and `aside` `(n, 2)` how `x` would move under
+    the probe.
     """
 
     x: jax.Array
     at: Evaluation
-    factor: Any
-    definite: jax.Array
-    marginal: jax.Array
+    stiffness: Stiffness
     step: jax.Array
     aside: jax.Array
     residual: jax.Array
@@ -120,24 +133,25 @@ def newton(
     ahead: jax.Array,
     budget: jax.Array,
     free: jax.Array,
+    passing: jax.Array | None,
     probe: Callable[[jax.Array, jax.Array], jax.Array],
     solver: Newton,
 ) -> State:
     """Newton's method from `x + ahead`, for a scene with unlocked indices; to be called inside jit.
 
     It starts as far along `ahead` as no element inverts, and takes at most `budget` steps. The first `free` of them
-    need not lower the energy, as long as the true Hessian is positive definite. The state it ends in holds the factor
-    of the Hessian at `x`. `probe(x, definite)` are nodal forces `(n, 2)` that are solved for beside the unbalanced
-    ones: a column more costs next to nothing.
+    need not lower the energy, as long as the true Hessian is positive definite. `probe(x, definite)` are nodal forces
+    `(n, 2)` that are solved for beside the unbalanced ones: a column more costs next to nothing.
+
+    The state it ends in holds the stiffness at `x`. Where it is only `passing`, what the last step started from will do
+    if that is no farther than `NEAR`: along a path most states lie there, and it saves them half the work.
     """
     rtol = solver.tolerance(x.dtype)
     zero, nothing, yes = jnp.zeros((), x.dtype), jnp.zeros_like(x), jnp.asarray(True)
     first = State(
         x=x,
         at=Evaluation(zero, zero, nothing, nothing),
-        factor=no_factor(layout, x.dtype, solver),
-        definite=yes,
-        marginal=~yes,
+        stiffness=Stiffness(no_factor(layout, x.dtype, solver), yes, ~yes, zero),
         step=ahead,
         aside=nothing,
         residual=jnp.asarray(jnp.inf, x.dtype),
@@ -146,34 +160,45 @@ def newton(
         running=yes,
     )
 
+    def stiffness_at(x: jax.Array, finite: jax.Array) -> Stiffness:
+        return factorise(scene, layout, x, assemble(layout, stencil_hessians(scene, x)), finite, solver)
+
+    def turned(x: jax.Array, aside: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(lambda x: evaluate(scene, x).gradient, (x,), (aside,))[1], aside
+
     def body(state: State) -> State:
-        bold = state.fresh | (state.definite & (state.counts[STEPS] < free))
+        bold = state.fresh | (state.stiffness.definite & (state.counts[STEPS] < free))
         x, at, halvings, moved = line_search(scene, state, bold, solver)
-        storage = assemble(layout, stencil_hessians(scene, x))
         unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, at.gradient)))
-        residual = unbalanced / force_scale(layout, storage, x, at, rtol)
+        balanced = unbalanced <= rtol * jnp.max(at.gradient_scale)
+        near = ~state.fresh & (correction(x, state.step) <= NEAR)
+        sure = state.stiffness.definite & ~state.stiffness.marginal
+        keep = None if passing is None else passing & near & balanced & sure
+        renew = True if keep is None else ~keep
+        stiffness = once(renew, stiffness_at, state.stiffness, x, jnp.isfinite(unbalanced))
+        residual = unbalanced / force_scale(stiffness.largest, x, at, rtol)
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
-        rough = (unbalanced > rtol * jnp.max(at.gradient_scale)) & (residual < 0.5 * state.residual)
-        factor, definite, marginal = factorise(scene, layout, x, storage, jnp.isfinite(residual), solver)
-        pulls = jnp.stack([at.gradient, probe(x, definite)])
-        moves = solver.linear.solve(layout, factor, jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls))
+        rough = ~balanced & (residual < 0.5 * state.residual)
+        # What was found with a stiffness that is kept is wrong by as little as that is; it is refined, not found anew.
+        held, aside = once(False if keep is None else keep, turned, (nothing, nothing), x, state.aside)
+        pulls = jnp.stack([at.gradient, probe(x, stiffness.definite) + held])
+        pulls = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls)
+        moves = solver.linear.solve(layout, stiffness.factor, pulls)
         moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
         # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
         # mode, and it rounds anew with each step.
         vague = (residual <= rtol) & (correction(x, moves[0]) > INACCURATE) & (state.counts[POLISHED] < POLISH)
         taken = moved & ~state.fresh
-        counted = jnp.stack([taken, taken & ~state.definite, halvings, vague], dtype=jnp.int32)
+        counted = jnp.stack([taken, taken & ~state.stiffness.definite, halvings, vague], dtype=jnp.int32)
         counts = state.counts + counted
         # False for NaN: there is nothing to go on from.
         wanted = ((residual > rtol) | rough | vague) & (counts[STEPS] < budget)
         return State(
             x=x,
             at=at,
-            factor=factor,
-            definite=definite,
-            marginal=marginal,
+            stiffness=stiffness,
             step=moves[0],
-            aside=moves[1],
+            aside=aside + moves[1],
             residual=residual,
             counts=counts,
             fresh=~yes,
@@ -194,22 +219,26 @@ def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:
     return blank(solver.linear.factor, layout, storage)[0]
 
 
-def force_scale(layout: Layout, storage: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
+def stiffest(layout: Layout, storage: jax.Array) -> jax.Array:
+    """The largest entry of the diagonal, `()`."""
+    unknown = layout.slots < layout.position.size
+    return jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
+
+
+def force_scale(stiffness: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
     """What an unbalanced force is compared with, `()`.
 
     The largest sum of magnitudes of the stencil forces at one coordinate, plus what makes `rtol` times the
     scale no smaller than the round-off of the forces: positions carry a relative error eps, which the
     stiffness turns into a force of `eps * max |x| * max K_ii` that no iteration can remove.
     """
-    unknown = layout.slots < layout.position.size
-    stiffness = jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
     round_off = FORCE_ROUND_OFF * jnp.finfo(x.dtype).eps * stiffness * jnp.max(jnp.abs(x))
     return jnp.max(at.gradient_scale) + round_off / rtol
 
 
 def factorise(
     scene: Scene, layout: Layout, x: jax.Array, storage: jax.Array, finite: jax.Array, solver: Newton
-) -> tuple[Any, jax.Array, jax.Array]:
+) -> Stiffness:
     """A positive definite factor: of the true Hessian if it has one, else of one blended with the projected one.
 
     The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along the soft
@@ -217,27 +246,21 @@ def factorise(
     of the true Hessian; and whether round-off decided that: it is so after a shift by no more, which is tried first, or
     a pivot is no more. One that is not `finite` is tried once.
     """
-    diagonal = storage[layout.diagonal]
-    stiffness, noise = jnp.max(jnp.abs(diagonal)), float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
-
-    def project_all(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        # Tied to the loop's state: XLA moves what does not change out of a loop, and the projection would be computed
-        # in every Newton step, needed or not.
-        _, here = lax.optimization_barrier((carry, x))
-        return assemble(layout, stencil_hessians(scene, here, convex=True)), jnp.zeros((), bool)
+    diagonal, largest = storage[layout.diagonal], stiffest(layout, storage)
+    noise = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
+    finite = finite & jnp.isfinite(largest)
+    convex_at = lambda x: assemble(layout, stencil_hessians(scene, x, convex=True))
 
     def attempt(carry: Any) -> Any:
         tries, _, _, convex = carry
-        # A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would
-        # always pay.
-        convex, _ = lax.while_loop(lambda c: c[1], project_all, (convex, tries == 2))
+        convex = once(tries == 2, convex_at, convex, x)
         count = tries.astype(storage.dtype)
         share = jnp.where(tries > 1, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 2)), 0.0)
-        more = jnp.where(share < 1, 0.0, 10.0 ** (count - 18)) * stiffness
+        more = jnp.where(share < 1, 0.0, 10.0 ** (count - 18)) * largest
         blend = (
             ((1 - share) * storage + share * convex)
             .at[layout.diagonal]
-            .add(jnp.where(tries == 1, noise * stiffness, more))
+            .add(jnp.where(tries == 1, noise * largest, more))
         )
         factor, done = solver.linear.factor(layout, blend)
         return tries + 1, factor, done, convex
@@ -246,7 +269,7 @@ def factorise(
     going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] <= MAX_BLENDS + 1))
     tries, factor, done, _ = lax.while_loop(going, attempt, begin)
     blunt = jnp.min(solver.linear.pivots(layout, factor) / diagonal) <= PIVOT_ROUND_OFF * noise
-    return factor, done & (tries == 1), done & ((tries == 2) | ((tries == 1) & blunt))
+    return Stiffness(factor, done & (tries == 1), done & ((tries == 2) | ((tries == 1) & blunt)), largest)
 
 
 def line_search(

@@ -12,13 +12,16 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 import jax
 import pytest
 
-# Nearly all of the time here is compilation. XLA's older emitters take half of it and run as fast, but a later version
-# may not know them; without LLVM's optimisation it is a third less again. Benchmarks verify what is optimised.
+# Nearly all of the time here is compilation: what the library asks for its own programs (`_tree.COMPILER_OPTIONS`) is
+# asked for all others as well, and LLVM optimises none. Benchmarks verify what is optimised.
 os.environ["XLA_FLAGS"] = (
     f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 )
 if jax.__version_info__ < (0, 11):
-    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] += (
+        " --xla_cpu_use_fusion_emitters=false"
+        " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
+    )
 
 import jaxbeam as jb
 
