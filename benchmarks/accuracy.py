@@ -96,6 +96,7 @@ def settings(quick: bool) -> list[Setting]:
     base = {"nx": 11, "ny": 5, "order": 2, "graded": True}
     for name, extra, solve in (
         ("float32", {"dtype": jnp.float32}, solved),
+        ("float32, residual 1e-3", {"dtype": jnp.float32}, partial(solved, solver=jb.Newton(rtol=1e-3))),
         ("residual 1e-4", {}, partial(solved, solver=jb.Newton(rtol=1e-4))),
         ("residual 1e-7", {}, partial(solved, solver=jb.Newton(rtol=1e-7))),
         ("ramp of 4", {}, partial(solved, steps=4)),

@@ -45,6 +45,8 @@ UNLIKE = 0.25
 # The estimate is repeated from where it leads until it changes by less than this share of it.
 SETTLED = 0.1
 MOST_STEPS = 6
+# By how much each step must be shorter than the one before for its factor to be used once more.
+SHRINKING = 0.3
 
 
 class ErrorEstimate(NamedTuple):
@@ -175,10 +177,13 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
     value, algebraic = own.value, own.total
     step = _change(finer, start, measure, solver, way)
     change, cancelled = step.total, min(step.parts[step.parts > 0].sum(), -step.parts[step.parts < 0].sum())
+    factor = step.factor
     for _ in range(MOST_STEPS):
         if not abs(step.total) > SETTLED * abs(change):
             break
-        step = _change(finer, step.x, measure, solver)
+        before, step = step, _change(finer, step.x, measure, solver, factor=factor)
+        # The stiffness of the first step serves the others too, while they shrink.
+        factor = step.factor if step.length < SHRINKING * before.length else None
         # A measure such as the mean over the tip may weigh nodes differently on another mesh.
         change = step.value - value + step.total
     moved = step.x
@@ -204,40 +209,53 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
 
 
 class _Change(NamedTuple):
-    """The value of a measure at a state; where one Newton step from there leads, `x`; by how much that changes it, to
-    first order; and of that, what each coordinate's force and adjoint contribute, `parts` `(n, 2)`."""
+    """The value of a measure at a state; where one Newton step from there leads, `x`, and its length; by how much that
+    changes the measure, to first order; and of that, what each coordinate's force and adjoint contribute, `parts`
+    `(n, 2)`. `factor` is that of the stiffness that was used."""
 
     value: float
     x: np.ndarray
+    length: float
     total: float
     parts: np.ndarray
+    factor: Any
 
 
-def _change(scene: Scene, x: Any, measure: Measure, solver: Newton, way: Finer | None = None) -> _Change:
-    """What a Newton step from `x` would change.
+def _change(
+    scene: Scene, x: Any, measure: Measure, solver: Newton, way: Finer | None = None, factor: Any = None
+) -> _Change:
+    """What a Newton step from `x` would change, by its own stiffness unless the factor of one near is given.
 
     If the state was carried over from a coarser mesh, the adjoint is taken less its own interpolation on that: the
     forces do no work on that, and what is left is local.
     """
     value, slope = _value_and_slope(scene, x, measure)
     layout = solver.linear.layout(topology(scene))
-    found = _newton_step(unlock(scene), layout, x, slope, solver)
+    factor = _factor(unlock(scene), layout, x, solver) if factor is None else factor
+    found = _newton_step(unlock(scene), layout, factor, x, slope, solver)
     slope, step, adjoint, forces = (np.asarray(each) for each in (slope, *found))
     local = adjoint if way is None else adjoint - way.carry(adjoint)
-    return _Change(float(value), x + step, float(np.sum(slope * step)), -local * forces)
+    return _Change(
+        float(value), x + step, float(np.abs(step).max()), float(np.sum(slope * step)), -local * forces, factor
+    )
+
+
+@compiled("solver")
+def _factor(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> tuple[Any, jax.Array]:
+    """A factor of the stiffness, and whether that is positive definite."""
+    return solver.linear.factor(layout, assemble(layout, stencil_hessians(scene, x)))
 
 
 @compiled("solver")
 def _newton_step(
-    scene: Scene, layout: Layout, x: jax.Array, slope: jax.Array, solver: Newton
+    scene: Scene, layout: Layout, factor: tuple[Any, jax.Array], x: jax.Array, slope: jax.Array, solver: Newton
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The step to balance, the adjoint of a measure of this slope, and the unbalanced forces, `(n, 2)` each; NaN where
     the stiffness is not positive definite."""
-    factor, definite = solver.linear.factor(layout, assemble(layout, stencil_hessians(scene, x)))
     forces = jnp.where(scene.fixed, 0, evaluate(scene, x).gradient)
     sides = jnp.stack([gather(layout, -forces), gather(layout, slope)], axis=1)
-    step, adjoint = (expand(layout, side, x.shape) for side in solver.linear.solve(layout, factor, sides).T)
-    return jnp.where(definite, step, jnp.nan), adjoint, forces
+    step, adjoint = (expand(layout, side, x.shape) for side in solver.linear.solve(layout, factor[0], sides).T)
+    return jnp.where(factor[1], step, jnp.nan), adjoint, forces
 
 
 @partial(jax.jit, static_argnames="measure")

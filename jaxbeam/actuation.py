@@ -46,8 +46,10 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     """Equilibria on the way from ratio 1 to `ratios`, each started from the one before.
 
     What a beam does when its tendons are pulled slowly: where an equilibrium depends on the path, this is
-    the one a user sees. Each start is moved along the tangent of the branch (one back-substitution with
-    the factor at hand).
+    the one a user sees. Each start is predicted from the states before and their tangents.
+
+    The last state is judged by its own stiffness. One on the way, if it is one last step of less than a millionth of
+    the body from where its Newton's method began, is judged by the stiffness there.
 
     Args:
         scene: with `m` tendons.
