@@ -75,7 +75,7 @@ FORCE_ROUND_OFF = 1.5
 PIVOT_ROUND_OFF = 2.0
 # Share of the projected Hessian tried first where the true one is not definite; tripled until it is one, then
 # shifts are added, each ten times the one before.
-FIRST_SHARE = 0.1
+FIRST_SHARE = 0.01
 MAX_BLENDS = 16
 
 # A step no longer than this, over the size of the body, leaves the stiffness as good as it was: what it changes of
