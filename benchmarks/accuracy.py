@@ -221,8 +221,11 @@ def draw(rows: list[dict[str, Any]]) -> Any:
                 front.append(entry)
                 best = entry[1]
         ax.loglog([ms for *_, ms in front], [error for _, error, _ in front], "k-", lw=0.8, zorder=0)
-        for name, error, ms in front:
-            ax.annotate(name, (ms, error), xytext=(5, 4), textcoords="offset points", fontsize=6.5)
+        ax.set_xlim(left=ax.get_xlim()[0] / 2)
+        for k, (name, error, ms) in enumerate(front):
+            # Below the front there is nothing, but for the axis beside the first.
+            where = {"xytext": (-6, -8), "ha": "right"} if k else {"xytext": (-4, 7)}
+            ax.annotate(name, (ms, error), textcoords="offset points", fontsize=6.5, **where)
         ax.set(title=f"Poisson's ratio {poisson}", xlabel="milliseconds of one solve")
         ax.grid(alpha=0.3, which="both", lw=0.4)
     axes[0, 0].set_ylabel("largest error of angle and tension, ratios 0.95 to 0.5 (%)")

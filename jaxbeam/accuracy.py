@@ -45,7 +45,8 @@ UNLIKE = 0.25
 # The estimate is repeated from where it leads until it changes by less than this share of it.
 SETTLED = 0.1
 MOST_STEPS = 6
-# By how much each step must be shorter than the one before for its factor to be used once more.
+# A factor serves the next step too after one under this share of the body, and by so much shorter than the one before.
+SMALL = 0.01
 SHRINKING = 0.3
 
 
@@ -177,13 +178,12 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
     value, algebraic = own.value, own.total
     step = _change(finer, start, measure, solver, way)
     change, cancelled = step.total, min(step.parts[step.parts > 0].sum(), -step.parts[step.parts < 0].sum())
-    factor = step.factor
+    near = SMALL * np.ptp(np.asarray(scene.mesh.nodes), axis=0).max()
     for _ in range(MOST_STEPS):
         if not abs(step.total) > SETTLED * abs(change):
             break
-        before, step = step, _change(finer, step.x, measure, solver, factor=factor)
-        # The stiffness of the first step serves the others too, while they shrink.
-        factor = step.factor if step.length < SHRINKING * before.length else None
+        factor = step.factor if step.length < near else None
+        near, step = min(near, SHRINKING * step.length), _change(finer, step.x, measure, solver, factor=factor)
         # A measure such as the mean over the tip may weigh nodes differently on another mesh.
         change = step.value - value + step.total
     moved = step.x
