@@ -194,7 +194,7 @@ def print_rows(rows: list[dict[str, Any]], poisson: float) -> None:
 
 
 def worst(rows: list[dict[str, Any]]) -> list[tuple[str, float, float]]:
-    """Of each setting: its largest error over all ratios, of angle and tension, and its mean time over the reference."""
+    """Of each setting: over all ratios its largest error, of angle or tension, and its mean time."""
     found = []
     for name in dict.fromkeys(row["setting"] for row in rows):
         own = [row for row in rows if row["setting"] == name]
