@@ -122,8 +122,8 @@ def follow(
         probe = lambda x, definite: jnp.where(definite, rate(x), noise)
         free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
         passing = walk.trial < targets[-1] if last else None
-        budget = jnp.where(walk.over, 0, budget)
-        state = newton(scene, layout, walk.start, walk.way, budget, free, passing, probe, solver)
+        allowed = jnp.where(walk.over, 0, budget)
+        state = newton(scene, layout, walk.start, walk.way, allowed, free, passing, probe, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
         steps, attempts, status = counts[0], counts[3], counts[-1]
 
@@ -134,7 +134,9 @@ def follow(
         may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > trail.s[0]) & ~spent_out
         # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
         inverted = (status & Status.INVERTED) != 0
-        good = converged & ~saddle & ~(inverted & may_cut) & ~walk.over
+        # So may one that balances with next to no stiffness left, where steps ran out: past a fold a beam creeps by it.
+        creeping = (state.counts[STEPS] >= budget) & (correction(state.x, state.step) > INACCURATE)
+        good = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~walk.over
         landed = good & (walk.trial == target)
         failed = ~good & ~saddle
         over = (~landed & spent_out) | (failed & ~may_cut)
