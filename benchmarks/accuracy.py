@@ -231,7 +231,8 @@ def draw(rows: list[dict[str, Any]]) -> Any:
             ax.loglog([time for *_, time in own], [error for _, error, _ in own], style, label=family, ms=7, alpha=0.8)
         front, best = [], np.inf
         for entry in sorted(entries, key=lambda entry: entry[2]):
-            if entry[1] < best:
+            # What is better by less than a tenth is not worth a name.
+            if entry[1] < 0.9 * best:
                 front.append(entry)
                 best = entry[1]
         ax.loglog([time for *_, time in front], [error for _, error, _ in front], "k-", lw=0.8, zorder=0)
