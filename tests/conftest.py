@@ -12,18 +12,15 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 import jax
 import pytest
 
-# Nearly all of the time here is compilation: what the library asks for its own programs (`_tree.COMPILER_OPTIONS`) is
-# asked for all others as well, and LLVM optimises none. Benchmarks verify what is optimised.
-os.environ["XLA_FLAGS"] = (
-    f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-)
-if jax.__version_info__ < (0, 11):
-    os.environ["XLA_FLAGS"] += (
-        " --xla_cpu_use_fusion_emitters=false"
-        " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
-    )
-
 import jaxbeam as jb
+from jaxbeam._tree import COMPILER_OPTIONS
+
+# Nearly all of the time here is compilation: what the library asks for its own programs is asked for all others as
+# well, and LLVM optimises none. XLA reads it when the first one is compiled. Benchmarks verify what is optimised.
+options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True, **(COMPILER_OPTIONS or {})}
+os.environ["XLA_FLAGS"] = " ".join(
+    [os.environ.get("XLA_FLAGS", ""), *(f"--{name}={str(value).lower()}" for name, value in options.items())]
+)
 
 jax.config.update("jax_enable_x64", True)
 
