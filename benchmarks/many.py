@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from benchmarks import reference, report, simkit_peer
-from benchmarks.timing import medians
+from benchmarks.timing import medians, seconds
 
 CORES = os.cpu_count() or 1
 SAMPLE = slice(None, None, 16)
@@ -102,10 +102,14 @@ def sweeps(repeats: int) -> dict[str, Any]:
 
 
 def threads(repeats: int) -> dict[str, float]:
-    """Seconds of the sweep on one core and on all, in turn, where XLA may use them."""
+    """Seconds of the sweep on one core and on all, in turn, where XLA may use them; the gain is the median of ratios."""
     scene, rows = jb.tendon_beam(), asymmetries(1024)
-    one, all = medians(partial(on, 1, scene, rows), partial(on, CORES, scene, rows), repeats=repeats)
-    return {"one thread": one.median, f"{CORES} threads": all.median, "gain": one.median / all.median}
+    runs = [partial(on, cores, scene, rows) for cores in (1, CORES)]
+    for run in runs:
+        run()
+    times = np.array([[seconds(run) for run in runs] for _ in range(repeats)])
+    one, all = np.median(times, axis=0)
+    return {"one thread": one, f"{CORES} threads": all, "gain": float(np.median(times[:, 0] / times[:, 1]))}
 
 
 def threads_apart(repeats: int) -> dict[str, float]:

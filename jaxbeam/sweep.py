@@ -269,13 +269,14 @@ def _everywhere(
     results: list[Solution] = []
     # Devices of a kind share the work by themselves; a processor's cores are one device, and each takes a job.
     workers = (os.cpu_count() or 1) if len(devices) == 1 and devices[0].platform == "cpu" else 1
+    if len(jobs) > 1:
+        # Nothing to do, but it compiles: each thread would.
+        solve([])
     with ThreadPoolExecutor(workers) as pool:
-        # The first alone, for it compiles.
-        for run, some in ((map, jobs[:1]), (pool.map, jobs[1:])):
-            for found in run(solve, some):
-                results += found
-                if progress is not None:
-                    progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
+        for found in pool.map(solve, jobs):
+            results += found
+            if progress is not None:
+                progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
     everyone = results if processes == 1 else _gathered(results, len(parts))
     return _assembled(parts, everyone)
 
