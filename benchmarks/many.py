@@ -102,7 +102,7 @@ def sweeps(repeats: int) -> dict[str, Any]:
 
 
 def threads(repeats: int) -> dict[str, float]:
-    """Seconds of the sweep on one core and on all, in turn, where XLA may use them; the gain is the median of ratios."""
+    """Seconds of the sweep on one core and on all, in turn, where XLA may use them. The gain is a median of ratios."""
     scene, rows = jb.tendon_beam(), asymmetries(1024)
     runs = [partial(on, cores, scene, rows) for cores in (1, CORES)]
     for run in runs:

@@ -41,10 +41,10 @@ PER_BLOCK = 40_000
 
 def multiplications(shape: tuple[int, int, int, int, int]) -> float:
     """What a factorisation by blocks of this shape (`Layout.blocks`) takes: a Cholesky of each block, a triangular
-    solve and a product for each coupling, and as much for the border."""
+    solve and a product for what couples it to the next and to the border."""
     b, w, head, tail, r = shape
-    border = r * (w * w / 2 + head * tail + w * r)
-    return b * (w**3 / 6 + head * tail**2 / 2 + head**2 * tail + border) + r**3 / 6
+    reach = w if r else tail
+    return b * (w**3 / 6 + reach**2 * (head + r) / 2 + reach * (head + r) ** 2) + r**3 / 6
 
 
 @lru_cache(maxsize=32)
@@ -56,7 +56,9 @@ def chain_of(topology: Topology, joined: int) -> Chain:
     )
     widest = int(np.bincount(best, weight).max())
     limits = {widest, *range(2 * widest, joined + 1, widest)}
-    chains = [_chain(topology, _joined(best, weight, limit)) for limit in limits]
+    blocks = [_joined(best, weight, limit) for limit in limits]
+    # Either way round: what couples two blocks may be few unknowns of the one and all of the other.
+    chains = [_chain(topology, each) for block in blocks for each in (block, block.max() - block)]
     return min(chains, key=lambda chain: multiplications(chain.shape) + PER_BLOCK * chain.shape[0])
 
 

@@ -147,14 +147,13 @@ def _dense_layout(topology: Topology) -> Layout:
 
 class BorderedFactor(NamedTuple):
     """`K = L L^T` by blocks: `pivot (b, w, w)` the transposes of its diagonal blocks, in which order LAPACK reads them,
-    `lower (b, head, tail)` the blocks left of them, `border (b, w, r)` the transposed rows of the border and
-    `corner (r, r)` its own pivot.
+    `beside (b, reach, head + r)` the transposes of what is below them and `corner (r, r)` the border's own pivot.
 
-    Only the last `tail` unknowns of a block are coupled to the next, and only to its first `head`."""
+    Only the last `tail` unknowns of a block are coupled to the next, and only to its first `head`: the first columns of
+    `beside`. The others are the border's. Where there is one all rows of a block are needed, else the last `tail`."""
 
     pivot: jax.Array
-    lower: jax.Array
-    border: jax.Array
+    beside: jax.Array
     corner: jax.Array
 
 
@@ -163,7 +162,7 @@ class BlockTridiagonal:
     """Bordered block-tridiagonal Cholesky over the levels of the mesh.
 
     Each of `b` blocks has `w` unknowns, of which the first `head` are coupled to the last `tail` of the block before;
-    with a border of `r` columns a factor holds `b (w^2 + head tail + w r)` numbers. For its time see `multiplications`.
+    with a border of `r` columns a factor holds `b (w^2 + w (head + r))` numbers. For its time see `multiplications`.
 
     joined: several levels of the mesh may make a block of up to this many unknowns. Fewer and wider blocks take more
         arithmetic and less time, while they are small.
@@ -175,33 +174,28 @@ class BlockTridiagonal:
         return _bordered_layout(topology, self.joined)
 
     def factor(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
-        w, _, tail, r = layout.blocks[1:]
-        diagonal, lower, border, corner = _pieces(layout, storage)
+        skip = layout.blocks[1] - reach_of(layout.blocks)
 
-        def eliminate(carry: Any, block: Any) -> Any:
-            pivot, above, schur = carry
-            diagonal, lower, border = block
-            lower = lax.linalg.triangular_solve(pivot.T, lower.T, left_side=True, lower=True).T
-            pivot = jnp.linalg.cholesky(diagonal - _first(lower @ lower.T, w, w), symmetrize_input=False).T
-            if r:
-                border = border - _first(lower @ above, w, r)
-                border = lax.linalg.triangular_solve(pivot.T, border, left_side=True, lower=True)
-                schur = schur - border.T @ border
-            return (pivot[w - tail :, w - tail :], border[w - tail :], schur), (pivot, lower, border)
+        def eliminate(diagonal: jax.Array, beside: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            pivot = jnp.linalg.cholesky(diagonal, symmetrize_input=False).T
+            # All that is left of the block's rows at once: a call costs more than its arithmetic.
+            beside = lax.linalg.triangular_solve(pivot[skip:, skip:].T, beside, left_side=True, lower=True)
+            return pivot, beside, beside.T @ beside
 
-        start = (jnp.eye(tail, dtype=storage.dtype), jnp.zeros((tail, r), storage.dtype), corner)
-        (_, _, schur), (pivot, lower, border) = lax.scan(eliminate, start, (diagonal, lower, border))
-        corner = jnp.linalg.cholesky(schur, symmetrize_input=False) if r else schur
+        (pivot, beside), corner = _eliminated(layout, storage, eliminate)
+        r = len(corner)
+        corner = jnp.linalg.cholesky(corner, symmetrize_input=False) if r else corner
         # A failed block is NaN, and so is everything after it.
         ok = jnp.isfinite(corner[-1, -1]) if r else jnp.isfinite(pivot[-1, -1, -1])
-        return BorderedFactor(pivot, lower, border, corner), ok
+        return BorderedFactor(pivot, beside, corner), ok
 
     def pivots(self, layout: Layout, factor: BorderedFactor) -> jax.Array:
         inner = jnp.diagonal(factor.pivot, axis1=1, axis2=2).ravel()
         return jnp.concatenate([inner, jnp.diagonal(factor.corner)]) ** 2
 
     def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
-        b, w, head, tail, r = layout.blocks
+        b, w, head, _, r = layout.blocks
+        reach = reach_of(layout.blocks)
         # Right-hand sides are rows here, so that the products below can be plain loops.
         k = rhs.size // len(rhs)
         inner, outer = rhs[: b * w].reshape(b, w, k).swapaxes(1, 2), rhs[b * w :].reshape(r, k)
@@ -209,85 +203,96 @@ class BlockTridiagonal:
             lax.linalg.triangular_solve(pivot.T, y.T, left_side=True, lower=True, transpose_a=transpose).T
         )
 
-        def forward(above: jax.Array, block: Any) -> Any:
-            pivot, lower, right = block
-            y = solve(pivot, right - _first(_times(above, lower.T), k, w), False)
-            return y[:, w - tail :], y
+        def forward(carry: Any, block: Any) -> Any:
+            passed, outer = carry
+            pivot, beside, right = block
+            y = solve(pivot, right - jnp.pad(passed, ((0, 0), (0, w - head))), False)
+            passed = _times(y[:, w - reach :], beside)
+            return (passed[:, :head], outer - passed[:, head:]), y
 
-        _, inner = lax.scan(forward, jnp.zeros((k, tail), rhs.dtype), (factor.pivot, factor.lower, inner))
+        none = jnp.zeros((k, head), rhs.dtype)
+        (_, outer), inner = lax.scan(forward, (none, outer.T), (factor.pivot, factor.beside, inner))
         if r:
-            outer = outer - jnp.einsum("bwr,bkw->rk", factor.border, inner)
-            outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True)
-            outer = lax.linalg.triangular_solve(factor.corner, outer, left_side=True, lower=True, transpose_a=True)
-            inner = inner - jnp.einsum("bwr,rk->bkw", factor.border, outer)
+            outer = solve(factor.corner.T, solve(factor.corner.T, outer, False), True)
 
-        def backward(below: jax.Array, block: Any) -> Any:
-            pivot, lower, right = block
-            y = solve(pivot, right - jnp.pad(below, ((0, 0), (w - tail, 0))), True)
-            return _times(y[:, :head], lower), y
+        def backward(after: jax.Array, block: Any) -> Any:
+            pivot, beside, right = block
+            known = _times(jnp.concatenate([after, outer], axis=1), beside.T)
+            y = solve(pivot, right - jnp.pad(known, ((0, 0), (w - reach, 0))), True)
+            return y[:, :head], y
 
-        _, inner = lax.scan(
-            backward, jnp.zeros((k, tail), rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True
-        )
-        return jnp.concatenate([inner.swapaxes(1, 2).reshape(b * w, k), outer]).reshape(rhs.shape)
+        _, inner = lax.scan(backward, none, (factor.pivot, factor.beside, inner), reverse=True)
+        return jnp.concatenate([inner.swapaxes(1, 2).reshape(b * w, k), outer.T]).reshape(rhs.shape)
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
         """Block `L D L^T` with the pivots `D` inverted through their eigenvalues.
 
         The inertia of the matrix is the sum of its pivots' (Haynsworth 1968).
         """
-        w, _, tail, r = layout.blocks[1:]
-        diagonal, lower, border, corner = _pieces(layout, storage)
+        skip = layout.blocks[1] - reach_of(layout.blocks)
 
-        def eliminate(carry: Any, block: Any) -> Any:
-            above, border_above, schur, count = carry
-            diagonal, lower, border = block
-            ahead = lower @ above
-            inverse, negative = _inverse(_mirrored(diagonal) - _first(ahead[:, w - tail :] @ lower.T, w, w))
-            border = border - _first(ahead @ border_above, w, r)
-            schur = schur - border.T @ inverse @ border
-            return (inverse[w - tail :], border, schur, count + negative), (inverse, border)
+        def eliminate(diagonal: jax.Array, beside: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
+            inverse, negative = _inverse(_mirrored(diagonal))
+            return (inverse, negative), beside, beside.T @ inverse[skip:, skip:] @ beside
 
-        zeros = jnp.zeros((w, w + r), storage.dtype)
-        carry = (zeros[:tail, :w], zeros[:, w:], _mirrored(corner), jnp.zeros((), jnp.int32))
-        (_, _, schur, count), (inverse, border) = lax.scan(eliminate, carry, (diagonal, lower, border))
-        corner, negative = _inverse(schur)
-        return BorderedFactor(inverse, lower, border, corner), count + negative
+        ((inverse, negative), beside), corner = _eliminated(layout, storage, eliminate)
+        corner, last = _inverse(_mirrored(corner))
+        return BorderedFactor(inverse, beside, corner), jnp.sum(negative) + last
 
     def solve_indefinite(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
-        b, w, head, tail, _ = layout.blocks
-        inner, outer = rhs[: b * w].reshape(b, w), rhs[b * w :]
+        b, w, head, _, _ = layout.blocks
+        reach = reach_of(layout.blocks)
 
-        def forward(above: jax.Array, block: Any) -> Any:
-            inverse, lower, right = block
-            y = right - jnp.pad(lower @ above, (0, w - head))
-            return (inverse @ y)[w - tail :], y
+        def forward(carry: Any, block: Any) -> Any:
+            passed, outer = carry
+            inverse, beside, right = block
+            y = right.at[:head].add(-passed)
+            passed = (inverse @ y)[w - reach :] @ beside
+            return (passed[:head], outer - passed[head:]), y
 
-        _, inner = lax.scan(forward, jnp.zeros(tail, rhs.dtype), (factor.pivot, factor.lower, inner))
-        outer = outer - jnp.einsum("bwr,bwv,bv->r", factor.border, factor.pivot, inner)
+        none = jnp.zeros(head, rhs.dtype)
+        blocks = (factor.pivot, factor.beside, rhs[: b * w].reshape(b, w))
+        (_, outer), inner = lax.scan(forward, (none, rhs[b * w :]), blocks)
         outer = factor.corner @ outer
-        inner = inner - factor.border @ outer
 
-        def backward(below: jax.Array, block: Any) -> Any:
-            inverse, lower, right = block
-            y = inverse @ (right - jnp.pad(below, (w - tail, 0)))
-            return lower.T @ y[:head], y
+        def backward(after: jax.Array, block: Any) -> Any:
+            inverse, beside, right = block
+            y = inverse @ right.at[w - reach :].add(-beside @ jnp.concatenate([after, outer]))
+            return y[:head], y
 
-        _, inner = lax.scan(backward, jnp.zeros(tail, rhs.dtype), (factor.pivot, factor.lower, inner), reverse=True)
+        _, inner = lax.scan(backward, none, (factor.pivot, factor.beside, inner), reverse=True)
         return jnp.concatenate([inner.reshape(b * w), outer])
 
 
-def _pieces(layout: Layout, storage: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Diagonal blocks `(b, w, w)` and those below `(b, head, tail)`, border `(b, w, r)` and corner `(r, r)` of a matrix
-    as it is stored."""
-    b, w, head, tail, r = layout.blocks
-    diagonal, lower, border, corner = jnp.split(storage, np.cumsum([b * w * w, b * head * tail, b * w * r]))
-    return diagonal.reshape(b, w, w), lower.reshape(b, head, tail), border.reshape(b, w, r), corner.reshape(r, r)
+def reach_of(blocks: tuple[int, int, int, int, int]) -> int:
+    """How many of the last rows of a block are coupled to anything after it."""
+    _, w, _, tail, r = blocks
+    return w if r else tail
 
 
-def _first(part: jax.Array, rows: int, columns: int) -> jax.Array:
-    """A matrix `(rows, columns)` of which `part` is the first corner, and the rest zero."""
-    return jnp.pad(part, ((0, rows - part.shape[0]), (0, columns - part.shape[1])))
+def _eliminated(
+    layout: Layout,
+    storage: jax.Array,
+    eliminate: Callable[[jax.Array, jax.Array], tuple[Any, jax.Array, jax.Array]],
+) -> tuple[tuple[Any, jax.Array], jax.Array]:
+    """Block after block eliminated: what `eliminate(diagonal, beside)` returns of each, `(pivot, beside)`, with leading
+    axis `b`, and what is left of the border's block. Third, it returns what is to be subtracted from all after it."""
+    b, w, head, _, r = layout.blocks
+    reach = reach_of(layout.blocks)
+    diagonal, beside, corner = jnp.split(storage, np.cumsum([b * w * w, b * reach * (head + r)]))
+
+    def one(carry: Any, block: Any) -> Any:
+        passed, corner = carry
+        diagonal, beside = block
+        diagonal = diagonal - jnp.pad(passed[:, :head], ((0, w - head), (0, w - head)))
+        if r:
+            beside = beside - jnp.pad(passed[:, head:], ((0, reach - head), (head, 0)))
+        pivot, beside, product = eliminate(diagonal, beside)
+        return (product[:head], corner - product[head:, head:]), (pivot, beside)
+
+    start = jnp.zeros((head, head + r), storage.dtype), corner.reshape(r, r)
+    (_, corner), found = lax.scan(one, start, (diagonal.reshape(b, w, w), beside.reshape(b, reach, head + r)))
+    return found, corner
 
 
 # Up to this width a loop is faster than a call of a matrix product.
@@ -322,9 +327,9 @@ def _bordered_layout(topology: Topology, joined: int) -> Layout:
     position = np.full(count * d, size)
     position[slots[taken]] = np.flatnonzero(taken)
 
-    lower_at = b * w * w
-    border_at = lower_at + b * head * tail
-    corner_at = border_at + b * w * r
+    reach, wide = reach_of(chain.shape), head + r
+    beside_at = b * w * w
+    corner_at = beside_at + b * reach * wide
 
     def place(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         bp, bq, sp, sq = p // w, q // w, p % w, q % w
@@ -332,8 +337,9 @@ def _bordered_layout(topology: Topology, joined: int) -> Layout:
         coupled = inside & (bp > bq)
         if (coupled & ((bp - bq > 1) | (sp >= head) | (sq < w - tail))).any():
             raise AssertionError("a stencil couples unknowns that are not neighbours")
-        at = np.where(coupled, lower_at + (bp * head + sp) * tail + sq - (w - tail), (bp * w + sp) * w + sq)
-        at = np.where(inside, at, border_at + q * r + (p - b * w))
+        beside = beside_at + (bq * reach + sq - (w - reach)) * wide
+        at = np.where(coupled, beside + sp, (bp * w + sp) * w + sq)
+        at = np.where(inside, at, beside + head + p - b * w)
         return np.where(q < b * w, at, corner_at + (p - b * w) * r + (q - b * w))
 
     inner = np.arange(b * w)

@@ -82,15 +82,17 @@ def rectangle(
             symmetric about mid-height (`ny` must be odd). `"crossed"`: four triangles about the centre.
         dtype: of the nodes; by default JAX's float.
         order: of the shape functions: 1 for triangles of three nodes, 2 for six (see `quadratic`).
-        graded: crowd columns where the left edge and the middle are, by the power 3/2 of the distance to their right,
-            and rows at both faces: for a beam that is clamped at that edge and steered from its middle.
+        graded: crowd columns right of the left edge, by the power 3/2 of the distance, and of the middle, by a
+            hyperbolic sine of it, with two thirds of the columns between these two (see `middle_column`); and rows at
+            both faces. For a beam that is clamped at that edge and steered from its middle.
 
     Returns:
         A `Mesh`, differentiable in `length` and `height`.
 
     Raises:
         ValueError: if a count is not a whole number of at least 2, an extent is not positive and finite,
-            `diagonals` or `order` is unknown, or a mirrored mesh is asked for with an even `ny`.
+            `diagonals` or `order` is unknown, a mirrored mesh is asked for with an even `ny`, or a graded one with an
+            `nx` of 2.
     """
     if order not in (1, 2):
         raise ValueError(f"order: expected 1 (triangles of three nodes) or 2 (of six), got {order!r}")
@@ -107,8 +109,9 @@ def rectangle(
         )
     across, along = np.linspace(0, 1, nx), np.linspace(-0.5, 0.5, ny)
     if graded:
-        half = across >= 0.5
-        across = 0.5 * (half + (2 * across - half) ** 1.5)
+        middle = middle_column(nx, graded)
+        left, right = np.arange(middle + 1) / middle, np.arange(1, nx - middle) / (nx - 1 - middle)
+        across = 0.5 * np.append(left**1.5, 1 + np.sinh(3.5 * right) / np.sinh(3.5))
         along = 0.6 * along + 0.2 * np.sin(np.pi * along)
     unit_x, unit_y = np.meshgrid(across - 0.5, along, indexing="ij")
     unit = np.stack([unit_x.ravel(), unit_y.ravel()], axis=1)
@@ -133,6 +136,24 @@ def rectangle(
     extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
     mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
     return quadratic(mesh) if order == 2 else mesh
+
+
+def middle_column(nx: int, graded: bool) -> int:
+    """The column of corners of a `rectangle` that lies in the middle of its length.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if graded and nx < 3:
+        raise ValueError(f"nx: expected at least 3 for a graded mesh, got {nx}: no node lies in the middle; use 3")
+    if graded:
+        return min(-(-2 * (nx - 1) // 3), nx - 2)
+    if nx % 2 == 0:
+        raise ValueError(
+            f"nx: expected an odd number, got {nx}: no node lies in the middle, where the tendons end; "
+            f"use {nx - 1 if nx > 2 else 3} or {nx + 1}"
+        )
+    return (nx - 1) // 2
 
 
 def check_length(name: str, value: Numbers) -> None:

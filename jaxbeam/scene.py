@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import Lame, lame, macklin_mueller
-from jaxbeam.mesh import Diagonals, Mesh, check_length, rectangle, with_middles
+from jaxbeam.mesh import Diagonals, Mesh, check_length, middle_column, rectangle, with_middles
 from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
 from jaxbeam.stencils import admissible_step, stencil_gradients, stencil_hessian, volume_ratios
 from jaxbeam.terms import (
@@ -111,7 +111,7 @@ def tendon_beam(
     bottom-middle node. Both are at their natural length, half the beam's.
 
     Args:
-        nx: corners of triangles along the length, odd, so that a middle one exists.
+        nx: corners of triangles along the length, odd unless `graded`, so that a middle one exists.
         ny: corners along the height.
         length: of the beam, positive.
         height: of the beam, positive.
@@ -133,16 +133,11 @@ def tendon_beam(
         A `Scene`, differentiable in every real argument.
 
     Raises:
-        ValueError: if `nx` is even, or as `rectangle`, `lame` and `tendons` do.
+        ValueError: if `nx` is even and the mesh not graded, or as `rectangle`, `lame` and `tendons` do.
     """
     mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order, graded=graded)
-    if nx % 2 == 0:
-        raise ValueError(
-            f"nx: expected an odd number, got {nx}: no node lies in the middle, where the tendons end; "
-            f"use {nx - 1 if nx > 2 else 3} or {nx + 1}"
-        )
     bottom_left, top_left = 0, ny - 1
-    bottom_middle = (nx - 1) // 2 * ny
+    bottom_middle = middle_column(nx, graded) * ny
     body = solid(mesh, lame(young, poisson), density, degree)
     pair = [[top_left, bottom_middle + ny - 1], [bottom_left, bottom_middle]]
     left, right = (with_middles(mesh, corners) for corners in (np.arange(ny), (nx - 1) * ny + np.arange(ny)))

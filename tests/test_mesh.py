@@ -142,12 +142,26 @@ def test_refuses(nodes, elements, message):
         ({"height": np.nan}, r"height: expected a positive finite number, got nan"),
         ({"height": [1.0, 2.0]}, r"height: expected a positive finite number, got \[1\.0, 2\.0\]"),
         ({"diagonals": "alternate"}, r"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got 'alternate'"),
+        ({"nx": 2, "graded": True}, r"nx: expected at least 3 for a graded mesh, got 2: no node .*; use 3"),
         ({"diagonals": "mirrored", "ny": 4}, r"ny: expected an odd number for mirrored diagonals, got 4.*use 5"),
     ],
 )
 def test_rectangle_refuses(arguments, message):
     with pytest.raises(ValueError, match=message):
         jb.rectangle(**({"length": 2.0, "height": 1.0, "nx": 3, "ny": 3} | arguments))
+
+
+@pytest.mark.parametrize("nx", [3, 4, 9, 30])
+def test_graded_columns_crowd_at_the_edge_and_in_the_middle(nx):
+    mesh = jb.rectangle(2.0, 1.0, nx, 4, graded=True)
+    columns, rows = np.unique(mesh.nodes[:, 0]), np.unique(mesh.nodes[:, 1])
+    assert len(columns) == nx and len(rows) == 4
+    np.testing.assert_allclose([*columns[[0, -1]], *rows[[0, -1]]], [-1, 1, -0.5, 0.5])
+    middle = int(np.flatnonzero(columns == 0)[0])
+    assert nx - 1 - middle <= middle <= 2 * (nx - 1 - middle) + 2
+    for half in (columns[: middle + 1], columns[middle:]):
+        assert (np.diff(np.diff(half)) > 0).all()
+    assert rows[1] - rows[0] < rows[2] - rows[1]
 
 
 def test_traced_topology_is_refused():
