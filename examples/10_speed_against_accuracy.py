@@ -27,7 +27,7 @@ MESHES: dict[str, dict[str, Any]] = {
     "three nodes, 29 x 7, crossed": {"nx": 29, "ny": 7, "diagonals": "crossed"},
     "six nodes, 7 x 3": {"nx": 7, "ny": 3, "order": 2},
     "six nodes, 15 x 5": {"nx": 15, "ny": 5, "order": 2},
-    "six nodes, 11 x 5, graded": {"nx": 11, "ny": 5, "order": 2, "graded": True},
+    "six nodes, 9 x 5, graded": {"nx": 9, "ny": 5, "order": 2, "graded": True},
     "six nodes, 21 x 7, graded": {"nx": 21, "ny": 7, "order": 2, "graded": True},
 }
 STYLES = {"by": ("k", "*"), "rod": ("C2", "D"), "three": ("C0", "o"), "six": ("C3", "s")}

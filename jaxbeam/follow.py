@@ -125,18 +125,8 @@ def follow(
         allowed = jnp.where(walk.over, 0, budget)
         state = newton(scene, layout, walk.start, walk.way, allowed, free, passing, probe, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
-        steps, attempts, status = counts[0], counts[3], counts[-1]
-
-        converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
-        unstable = (status & Status.UNSTABLE) != 0
-        saddle = converged & unstable & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
-        spent_out = (steps >= solver.max_steps) | (attempts >= MAX_ATTEMPTS) | ~sound
-        may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > trail.s[0]) & ~spent_out
-        # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
-        inverted = (status & Status.INVERTED) != 0
-        # So may one that balances with next to no stiffness left, where steps ran out: past a fold a beam creeps by it.
-        creeping = (state.counts[STEPS] >= budget) & (correction(state.x, state.step) > INACCURATE)
-        good = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~walk.over
+        attempts, status = counts[3], counts[-1]
+        good, saddle, spent_out, may_cut = _judged(walk, state, counts, budget, sound, solver)
         landed = good & (walk.trial == target)
         failed = ~good & ~saddle
         over = (~landed & spent_out) | (failed & ~may_cut)
@@ -192,6 +182,34 @@ def follow(
     path = jax.tree.map(lambda all: all[row], walk.path)
     ratios = jax.vmap(lambda s: ratios_of(scene_at(s)))(targets)
     return _solutions(path, ratios, solver), walk.factor, walk.trail
+
+
+class Verdict(NamedTuple):
+    """What to make of an attempt: whether its state is `good` to go on from, or a `saddle` to leave; whether all that
+    may be spent on the target is, and whether the way may be cut."""
+
+    good: jax.Array
+    saddle: jax.Array
+    spent_out: jax.Array
+    may_cut: jax.Array
+
+
+def _judged(
+    walk: Walk, state: State, counts: jax.Array, budget: jax.Array, sound: jax.Array, solver: Newton
+) -> Verdict:
+    """The verdict on an attempt of at most `budget` steps, by the `counts` of its report."""
+    steps, attempts, status = counts[0], counts[3], counts[-1]
+    converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
+    unstable = (status & Status.UNSTABLE) != 0
+    saddle = converged & unstable & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
+    spent_out = (steps >= solver.max_steps) | (attempts >= MAX_ATTEMPTS) | ~sound
+    may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > walk.trail.s[0]) & ~spent_out
+    # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
+    inverted = (status & Status.INVERTED) != 0
+    # So may one that balances with next to no stiffness left, where steps ran out: past a fold a beam creeps by it.
+    creeping = (state.counts[STEPS] >= budget) & (correction(state.x, state.step) > INACCURATE)
+    good = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~walk.over
+    return Verdict(good, saddle, spent_out, may_cut)
 
 
 def _report(

@@ -237,7 +237,7 @@ class BlockTridiagonal:
 
         ((inverse, negative), beside), corner = _eliminated(layout, storage, eliminate)
         corner, last = _inverse(_mirrored(corner))
-        return BorderedFactor(inverse, beside, corner), jnp.sum(negative) + last
+        return BorderedFactor(inverse, beside, corner), jnp.sum(negative, dtype=jnp.int32) + last
 
     def solve_indefinite(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
         b, w, head, _, _ = layout.blocks
