@@ -39,12 +39,19 @@ class Chain(NamedTuple):
 PER_BLOCK = 40_000
 
 
+def coupled(shape: tuple[int, int, int, int, int]) -> tuple[int, int]:
+    """How many of the last rows of a block are coupled to anything after it, and to how many columns: the first ones of
+    the next block and the border's."""
+    _, w, head, tail, r = shape
+    return (w if r else tail), head + r
+
+
 def multiplications(shape: tuple[int, int, int, int, int]) -> float:
     """What a factorisation by blocks of this shape (`Layout.blocks`) takes: a Cholesky of each block, a triangular
-    solve and a product for what couples it to the next and to the border."""
-    b, w, head, tail, r = shape
-    reach = w if r else tail
-    return b * (w**3 / 6 + reach**2 * (head + r) / 2 + reach * (head + r) ** 2) + r**3 / 6
+    solve and a product for what it is coupled to."""
+    b, w, _, _, r = shape
+    tall, wide = coupled(shape)
+    return b * (w**3 / 6 + tall**2 * wide / 2 + tall * wide**2) + r**3 / 6
 
 
 @lru_cache(maxsize=32)

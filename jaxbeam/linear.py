@@ -27,7 +27,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._tree import pytree, static_field, to_device
-from jaxbeam.chain import Topology, chain_of
+from jaxbeam.chain import Topology, chain_of, coupled
 
 
 @pytree
@@ -147,10 +147,10 @@ def _dense_layout(topology: Topology) -> Layout:
 
 class BorderedFactor(NamedTuple):
     """`K = L L^T` by blocks: `pivot (b, w, w)` the transposes of its diagonal blocks, in which order LAPACK reads them,
-    `beside (b, reach, head + r)` the transposes of what is below them and `corner (r, r)` the border's own pivot.
+    `beside (b, tall, head + r)` the transposes of what is below them and `corner (r, r)` the border's own pivot.
 
     Only the last `tail` unknowns of a block are coupled to the next, and only to its first `head`: the first columns of
-    `beside`. The others are the border's. Where there is one all rows of a block are needed, else the last `tail`."""
+    `beside`. The others are the border's. Where there is one all rows of a block are kept, else the last `tail`."""
 
     pivot: jax.Array
     beside: jax.Array
@@ -174,7 +174,7 @@ class BlockTridiagonal:
         return _bordered_layout(topology, self.joined)
 
     def factor(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
-        skip = layout.blocks[1] - reach_of(layout.blocks)
+        skip = layout.blocks[1] - coupled(layout.blocks)[0]
 
         def eliminate(diagonal: jax.Array, beside: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             pivot = jnp.linalg.cholesky(diagonal, symmetrize_input=False).T
@@ -195,7 +195,7 @@ class BlockTridiagonal:
 
     def solve(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
         b, w, head, _, r = layout.blocks
-        reach = reach_of(layout.blocks)
+        tall, _ = coupled(layout.blocks)
         # Right-hand sides are rows here, so that the products below can be plain loops.
         k = rhs.size // len(rhs)
         inner, outer = rhs[: b * w].reshape(b, w, k).swapaxes(1, 2), rhs[b * w :].reshape(r, k)
@@ -207,7 +207,7 @@ class BlockTridiagonal:
             passed, outer = carry
             pivot, beside, right = block
             y = solve(pivot, right - jnp.pad(passed, ((0, 0), (0, w - head))), False)
-            passed = _times(y[:, w - reach :], beside)
+            passed = _times(y[:, w - tall :], beside)
             return (passed[:, :head], outer - passed[:, head:]), y
 
         none = jnp.zeros((k, head), rhs.dtype)
@@ -218,7 +218,7 @@ class BlockTridiagonal:
         def backward(after: jax.Array, block: Any) -> Any:
             pivot, beside, right = block
             known = _times(jnp.concatenate([after, outer], axis=1), beside.T)
-            y = solve(pivot, right - jnp.pad(known, ((0, 0), (w - reach, 0))), True)
+            y = solve(pivot, right - jnp.pad(known, ((0, 0), (w - tall, 0))), True)
             return y[:, :head], y
 
         _, inner = lax.scan(backward, none, (factor.pivot, factor.beside, inner), reverse=True)
@@ -229,7 +229,7 @@ class BlockTridiagonal:
 
         The inertia of the matrix is the sum of its pivots' (Haynsworth 1968).
         """
-        skip = layout.blocks[1] - reach_of(layout.blocks)
+        skip = layout.blocks[1] - coupled(layout.blocks)[0]
 
         def eliminate(diagonal: jax.Array, beside: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
             inverse, negative = _inverse(_mirrored(diagonal))
@@ -241,13 +241,13 @@ class BlockTridiagonal:
 
     def solve_indefinite(self, layout: Layout, factor: BorderedFactor, rhs: jax.Array) -> jax.Array:
         b, w, head, _, _ = layout.blocks
-        reach = reach_of(layout.blocks)
+        tall, _ = coupled(layout.blocks)
 
         def forward(carry: Any, block: Any) -> Any:
             passed, outer = carry
             inverse, beside, right = block
             y = right.at[:head].add(-passed)
-            passed = (inverse @ y)[w - reach :] @ beside
+            passed = (inverse @ y)[w - tall :] @ beside
             return (passed[:head], outer - passed[head:]), y
 
         none = jnp.zeros(head, rhs.dtype)
@@ -257,17 +257,11 @@ class BlockTridiagonal:
 
         def backward(after: jax.Array, block: Any) -> Any:
             inverse, beside, right = block
-            y = inverse @ right.at[w - reach :].add(-beside @ jnp.concatenate([after, outer]))
+            y = inverse @ right.at[w - tall :].add(-beside @ jnp.concatenate([after, outer]))
             return y[:head], y
 
         _, inner = lax.scan(backward, none, (factor.pivot, factor.beside, inner), reverse=True)
         return jnp.concatenate([inner.reshape(b * w), outer])
-
-
-def reach_of(blocks: tuple[int, int, int, int, int]) -> int:
-    """How many of the last rows of a block are coupled to anything after it."""
-    _, w, _, tail, r = blocks
-    return w if r else tail
 
 
 def _eliminated(
@@ -278,20 +272,20 @@ def _eliminated(
     """Block after block eliminated: what `eliminate(diagonal, beside)` returns of each, `(pivot, beside)`, with leading
     axis `b`, and what is left of the border's block. Third, it returns what is to be subtracted from all after it."""
     b, w, head, _, r = layout.blocks
-    reach = reach_of(layout.blocks)
-    diagonal, beside, corner = jnp.split(storage, np.cumsum([b * w * w, b * reach * (head + r)]))
+    tall, wide = coupled(layout.blocks)
+    diagonal, beside, corner = jnp.split(storage, np.cumsum([b * w * w, b * tall * wide]))
 
     def one(carry: Any, block: Any) -> Any:
         passed, corner = carry
         diagonal, beside = block
         diagonal = diagonal - jnp.pad(passed[:, :head], ((0, w - head), (0, w - head)))
         if r:
-            beside = beside - jnp.pad(passed[:, head:], ((0, reach - head), (head, 0)))
+            beside = beside - jnp.pad(passed[:, head:], ((0, tall - head), (head, 0)))
         pivot, beside, product = eliminate(diagonal, beside)
         return (product[:head], corner - product[head:, head:]), (pivot, beside)
 
-    start = jnp.zeros((head, head + r), storage.dtype), corner.reshape(r, r)
-    (_, corner), found = lax.scan(one, start, (diagonal.reshape(b, w, w), beside.reshape(b, reach, head + r)))
+    start = jnp.zeros((head, wide), storage.dtype), corner.reshape(r, r)
+    (_, corner), found = lax.scan(one, start, (diagonal.reshape(b, w, w), beside.reshape(b, tall, wide)))
     return found, corner
 
 
@@ -327,9 +321,9 @@ def _bordered_layout(topology: Topology, joined: int) -> Layout:
     position = np.full(count * d, size)
     position[slots[taken]] = np.flatnonzero(taken)
 
-    reach, wide = reach_of(chain.shape), head + r
+    tall, wide = coupled(chain.shape)
     beside_at = b * w * w
-    corner_at = beside_at + b * reach * wide
+    corner_at = beside_at + b * tall * wide
 
     def place(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         bp, bq, sp, sq = p // w, q // w, p % w, q % w
@@ -337,7 +331,7 @@ def _bordered_layout(topology: Topology, joined: int) -> Layout:
         coupled = inside & (bp > bq)
         if (coupled & ((bp - bq > 1) | (sp >= head) | (sq < w - tail))).any():
             raise AssertionError("a stencil couples unknowns that are not neighbours")
-        beside = beside_at + (bq * reach + sq - (w - reach)) * wide
+        beside = beside_at + (bq * tall + sq - (w - tall)) * wide
         at = np.where(coupled, beside + sp, (bp * w + sp) * w + sq)
         at = np.where(inside, at, beside + head + p - b * w)
         return np.where(q < b * w, at, corner_at + (p - b * w) * r + (q - b * w))
