@@ -235,12 +235,12 @@ def draw(rows: list[dict[str, Any]]) -> Any:
             ax.loglog([time for *_, time in own], [error for _, error, _ in own], style, label=family, ms=7, alpha=0.8)
         front, best = [], np.inf
         for entry in sorted(entries, key=lambda entry: entry[2]):
-            # What is better by less than a tenth is not worth a name.
-            if entry[1] < 0.9 * best:
+            # What is better by less than a quarter is not worth a name.
+            if entry[1] < 0.75 * best:
                 front.append(entry)
                 best = entry[1]
         ax.loglog([time for *_, time in front], [error for _, error, _ in front], "k-", lw=0.8, zorder=0)
-        ax.set_xlim(left=ax.get_xlim()[0] / 2)
+        ax.set_xlim(left=ax.get_xlim()[0] / 6)
         for k, (name, error, time) in enumerate(front):
             # Below the front there is nothing, but for the axis beside the first.
             where = {"xytext": (-6, -8), "ha": "right"} if k else {"xytext": (-4, 7)}

@@ -49,11 +49,18 @@ def static_field(**kwargs: Any) -> Any:
 class Key:
     """A NumPy array hashed and compared by content."""
 
-    __slots__ = ("_hash", "array")
+    __slots__ = ("_device", "_hash", "array")
 
     def __init__(self, array: np.ndarray) -> None:
         self.array = array
         self._hash = hash((array.shape, array.dtype.str, array.tobytes()))
+        self._device: jax.Array | None = None
+
+    def on_device(self) -> jax.Array:
+        """The array as one of JAX's, made once."""
+        if self._device is None:
+            self._device = to_device(self.array)
+        return self._device
 
     def __hash__(self) -> int:
         return self._hash
@@ -83,7 +90,7 @@ def pytree(cls: type[T]) -> type[T]:
         for name in names["index"]:
             value = getattr(self, name)
             if isinstance(value, np.ndarray):
-                keys.append(_key(self, name, value))
+                keys.append(key_of(self, name))
             else:
                 keys.append(None)
                 children.append((jax.tree_util.GetAttrKey(name), value))
@@ -98,7 +105,7 @@ def pytree(cls: type[T]) -> type[T]:
         for name, key in zip(names["index"], keys, strict=True):
             object.__setattr__(self, name, next(values) if key is None else key.array)
             if key is not None:
-                self.__dict__["_key_" + name] = key
+                _keys(self)[name] = key
         for name, value in zip(names["static"], statics, strict=True):
             object.__setattr__(self, name, value)
         return self
@@ -107,13 +114,17 @@ def pytree(cls: type[T]) -> type[T]:
     return cls
 
 
-def _key(owner: Any, name: str, array: np.ndarray) -> Key:
-    """The key of an index array, hashed once per owner."""
-    cache = owner.__dict__
-    slot = "_key_" + name
-    if slot not in cache:
-        cache[slot] = Key(array)
-    return cache[slot]
+def key_of(owner: Any, name: str) -> Key:
+    """The key of an index array, which is hashed once: a scene is commanded and solved again and again."""
+    keys, array = _keys(owner), getattr(owner, name)
+    if name not in keys or keys[name].array is not array:
+        keys[name] = Key(array)
+    return keys[name]
+
+
+def _keys(owner: Any) -> dict[str, Key]:
+    """Keys of an owner's index arrays, as far as they were asked for; `replace` hands them on to its copies."""
+    return owner.__dict__.setdefault("_keys", {})
 
 
 def unlock(tree: T) -> T:
@@ -126,12 +137,8 @@ def unlock(tree: T) -> T:
     new = object.__new__(type(tree))
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
-        if field.metadata.get("kind") == "index" and value is not None:
-            # Once an owner: a scene is commanded and solved again and again.
-            slot = "_device_" + field.name
-            if slot not in tree.__dict__:
-                object.__setattr__(tree, slot, to_device(value))
-            value = tree.__dict__[slot]
+        if isinstance(value, np.ndarray) and field.metadata.get("kind") == "index":
+            value = key_of(tree, field.name).on_device()
         elif "kind" not in field.metadata:
             value = unlock(value)
         object.__setattr__(new, field.name, value)
@@ -141,6 +148,7 @@ def unlock(tree: T) -> T:
 def replace(tree: T, **changes: Any) -> T:
     """A copy with some data fields changed: like `dataclasses.replace`, but nothing is validated again."""
     new = object.__new__(type(tree))
+    _keys(tree)
     new.__dict__.update(tree.__dict__ | changes)
     return new
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 import jax
 import numpy as np
 
-from jaxbeam._tree import Key, is_concrete, replace
+from jaxbeam._tree import Key, is_concrete, key_of, replace
 from jaxbeam.mesh import pieces
 from jaxbeam.rod import Line, RodEnergy
 from jaxbeam.scene import Scene, stencil_hessians
@@ -26,7 +26,9 @@ def check_held(scene: Scene) -> None:
     Raises:
         ValueError: that names the piece and its free motions. Nothing is checked while a value is traced.
     """
-    if not is_concrete(*jax.tree.leaves(scene)) or _clamps_suffice(Key(scene.mesh.elements), Key(scene.fixed)):
+    if not is_concrete(*jax.tree.leaves(scene)):
+        return
+    if _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
         return
     whole, piece = np.asarray(scene.mesh.nodes, float), pieces(scene.mesh.elements, scene.mesh.nodes.shape[0])
     rest = whole[:, :2]

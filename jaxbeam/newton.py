@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Key, blank, choose, once
+from jaxbeam._tree import blank, choose, key_of, once
 from jaxbeam.chain import Topology
 from jaxbeam.dissection import Automatic
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
@@ -88,7 +88,8 @@ POLISH = 10
 
 def topology(scene: Scene) -> Topology:
     """The structure of a scene, on which the layout of its matrix depends."""
-    return Topology(Key(scene.mesh.elements), Key(scene.fixed), tuple(Key(term.nodes) for term in scene.terms))
+    nodes = tuple(key_of(term, "nodes") for term in scene.terms)
+    return Topology(key_of(scene.mesh, "elements"), key_of(scene, "fixed"), nodes)
 
 
 # What `State.counts` counts.

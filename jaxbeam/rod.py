@@ -410,10 +410,24 @@ def euler_bernoulli(
     """
     if np.shape(ratios) != (2,):
         raise ValueError(f"ratios: expected shape (2,), of the top and the bottom tendon, got {np.shape(ratios)}")
-    length, height = jnp.asarray(length), jnp.asarray(height)
-    half, plane = 0.5 * length, jnp.asarray(young) / (1 - jnp.asarray(poisson) ** 2)
-    commanded = jnp.asarray(ratios) * half
-    k = stiffness(jnp.asarray(tendon_modulus), commanded)
+    values = (ratios, length, height, young, poisson, tendon_modulus)
+    xp = namespace(*jax.tree.leaves(values))
+    return _by_hand(*(xp.asarray(value) for value in values), stiffness)
+
+
+@partial(jax.jit, static_argnames="stiffness")
+def _by_hand(
+    ratios: jax.Array,
+    length: jax.Array,
+    height: jax.Array,
+    young: jax.Array,
+    poisson: jax.Array,
+    tendon_modulus: jax.Array,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array],
+) -> Estimate:
+    half, plane = 0.5 * length, young / (1 - poisson**2)
+    commanded = ratios * half
+    k = stiffness(tendon_modulus, commanded)
     # Tensions are k (a - l* + a rows . (eps, kappa)).
     rows = jnp.stack([jnp.ones(2), height * jnp.array([-0.5, 0.5])], axis=1)
     section = jnp.stack([plane * height, plane * height**3 / 12])
