@@ -84,8 +84,8 @@ def pytree(cls: type[T]) -> type[T]:
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         names[field.metadata.get("kind", "data")].append(field.name)
 
-    def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], Any]:
-        children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in names["data"]]
+    def flatten(self: Any) -> tuple[list[Any], Any]:
+        children = [getattr(self, name) for name in names["data"]]
         keys: list[Key | None] = []
         for name in names["index"]:
             value = getattr(self, name)
@@ -93,8 +93,13 @@ def pytree(cls: type[T]) -> type[T]:
                 keys.append(key_of(self, name))
             else:
                 keys.append(None)
-                children.append((jax.tree_util.GetAttrKey(name), value))
+                children.append(value)
         return children, (tuple(keys), tuple(getattr(self, name) for name in names["static"]))
+
+    def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], Any]:
+        children, aux = flatten(self)
+        named = names["data"] + [name for name, key in zip(names["index"], aux[0], strict=True) if key is None]
+        return [(jax.tree_util.GetAttrKey(name), child) for name, child in zip(named, children, strict=True)], aux
 
     def unflatten(aux: Any, children: Any) -> Any:
         keys, statics = aux
@@ -110,7 +115,7 @@ def pytree(cls: type[T]) -> type[T]:
             object.__setattr__(self, name, value)
         return self
 
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
 
 

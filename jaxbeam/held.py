@@ -26,9 +26,10 @@ def check_held(scene: Scene) -> None:
     Raises:
         ValueError: that names the piece and its free motions. Nothing is checked while a value is traced.
     """
-    if not is_concrete(*jax.tree.leaves(scene)):
+    known = is_concrete(scene.mesh.elements, scene.fixed)
+    if known and _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
         return
-    if _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
+    if not is_concrete(*jax.tree.leaves(scene)):
         return
     whole, piece = np.asarray(scene.mesh.nodes, float), pieces(scene.mesh.elements, scene.mesh.nodes.shape[0])
     rest = whole[:, :2]
