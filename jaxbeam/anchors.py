@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from jaxbeam._tree import Key, is_concrete, read_only
+from jaxbeam._tree import Key, is_concrete, key_of, read_only
 from jaxbeam.elements import EDGES
 from jaxbeam.mesh import Mesh
 
@@ -77,7 +77,7 @@ def walk(
 def surface(mesh: Mesh) -> np.ndarray:
     """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
     body, and the node between them if there is one."""
-    return _surface(Key(mesh.elements))
+    return _surface(key_of(mesh, "elements"))
 
 
 @lru_cache(maxsize=32)

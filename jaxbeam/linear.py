@@ -162,7 +162,8 @@ class BlockTridiagonal:
     """Bordered block-tridiagonal Cholesky over the levels of the mesh.
 
     Each of `b` blocks has `w` unknowns, of which the first `head` are coupled to the last `tail` of the block before;
-    with a border of `r` columns a factor holds `b (w^2 + w (head + r))` numbers. For its time see `multiplications`.
+    a factor holds `b (w^2 + tail head)` numbers, or with a border of `r` columns `b (w^2 + w (head + r))`. For its time
+    see `multiplications`.
 
     joined: several levels of the mesh may make a block of up to this many unknowns. Fewer and wider blocks take more
         arithmetic and less time, while they are small.
@@ -328,11 +329,11 @@ def _bordered_layout(topology: Topology, joined: int) -> Layout:
     def place(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         bp, bq, sp, sq = p // w, q // w, p % w, q % w
         inside = p < b * w
-        coupled = inside & (bp > bq)
-        if (coupled & ((bp - bq > 1) | (sp >= head) | (sq < w - tail))).any():
+        under = inside & (bp > bq)
+        if (under & ((bp - bq > 1) | (sp >= head) | (sq < w - tail))).any():
             raise AssertionError("a stencil couples unknowns that are not neighbours")
         beside = beside_at + (bq * tall + sq - (w - tall)) * wide
-        at = np.where(coupled, beside + sp, (bp * w + sp) * w + sq)
+        at = np.where(under, beside + sp, (bp * w + sp) * w + sq)
         at = np.where(inside, at, beside + head + p - b * w)
         return np.where(q < b * w, at, corner_at + (p - b * w) * r + (q - b * w))
 

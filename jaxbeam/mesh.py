@@ -111,6 +111,7 @@ def rectangle(
     if graded:
         middle = middle_column(nx, graded)
         left, right = np.arange(middle + 1) / middle, np.arange(1, nx - middle) / (nx - 1 - middle)
+        # Of 2.5, 3 and 3.5 the last left the reference beam the least error on most meshes.
         across = 0.5 * np.append(left**1.5, 1 + np.sinh(3.5 * right) / np.sinh(3.5))
         along = 0.6 * along + 0.2 * np.sin(np.pi * along)
     unit_x, unit_y = np.meshgrid(across - 0.5, along, indexing="ij")

@@ -425,6 +425,7 @@ def _by_hand(
     tendon_modulus: jax.Array,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array],
 ) -> Estimate:
+    """`euler_bernoulli` of arrays."""
     half, plane = 0.5 * length, young / (1 - poisson**2)
     commanded = ratios * half
     k = stiffness(tendon_modulus, commanded)
