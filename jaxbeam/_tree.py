@@ -89,7 +89,8 @@ def pytree(cls: type[T]) -> type[T]:
         keys: list[Key | None] = []
         for name in names["index"]:
             value = getattr(self, name)
-            if isinstance(value, np.ndarray):
+            # JAX's tangents of whole numbers are NumPy arrays too, of kind V: they are leaves.
+            if isinstance(value, np.ndarray) and value.dtype.kind != "V":
                 keys.append(key_of(self, name))
             else:
                 keys.append(None)

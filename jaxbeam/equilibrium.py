@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam._rules import custom_derivative
 from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock
 from jaxbeam.dissection import Automatic
 from jaxbeam.follow import follow
@@ -107,7 +108,7 @@ def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any
     )
 
 
-@jax.custom_jvp
+@custom_derivative
 def _sane(ratios: jax.Array, good: jax.Array) -> jax.Array:
     """The command of a good row; ratio 1 in place of a bad one, which may be 0 or NaN. Derivatives pass through.
 

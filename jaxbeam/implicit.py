@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxbeam._rules import custom_derivative
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.scene import Scene, energy, stencil_hessians
 
@@ -44,7 +45,7 @@ def _solve(linear: LinearSolver) -> Callable[[Layout, Any, jax.Array], jax.Array
     return solve
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@partial(custom_derivative, static=1)
 def follow_scene(
     linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
 ) -> jax.Array:

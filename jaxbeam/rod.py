@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam._rules import custom_derivative
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
 from jaxbeam.materials import macklin_mueller
 from jaxbeam.mesh import Mesh, check_count, check_length
@@ -206,7 +207,7 @@ def fibre_stretches(x: jax.Array, params: RodParams) -> jax.Array:
     return 1 + jnp.stack([stretch - half, stretch + half])
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@partial(custom_derivative, static=1)
 def fibre_energy(density: Callable[[jax.Array, Any], jax.Array], e: jax.Array, material: Any) -> jax.Array:
     """`W(e) = min_q psi(diag(e, q))`: of a material stretched to `1 + e` in plane strain, free to contract across."""
     return _plain(density, e, _contraction(density, e, material), material)
@@ -233,7 +234,7 @@ def _plain(density: Callable[[jax.Array, Any], jax.Array], e: jax.Array, q: jax.
     return density(jnp.stack([jnp.stack([e, zero]), jnp.stack([zero, q])]), material)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@partial(custom_derivative, static=1)
 def _contraction(density: Callable[[jax.Array, Any], jax.Array], e: jax.Array, material: Any) -> jax.Array:
     """`q` at which `psi(diag(e, q))` is least, by Newton's method. Exact after one step where `psi` is quadratic."""
     force = jax.grad(partial(_plain, density), argnums=1)
