@@ -22,7 +22,7 @@ T = TypeVar("T")
 Axes = tuple[tuple[int | None, ...], ...]
 
 
-class custom_derivative(Generic[T]):  # noqa: N801 - a decorator, named as `jax.custom_jvp` is
+class custom_derivative(Generic[T]):
     """Decorator: a function of pytrees of arrays whose derivative is what `defjvp` says, like `jax.custom_jvp`.
 
     Args:

@@ -77,12 +77,15 @@ def walk(
 def surface(mesh: Mesh) -> np.ndarray:
     """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
     body, and the node between them if there is one."""
-    return _surface(key_of(mesh, "elements"))
+    return surface_of((key_of(mesh, "elements"),))
 
 
 @lru_cache(maxsize=32)
-def _surface(elements: Key) -> np.ndarray:
-    triangles = elements.array
+def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
+    """The edges of the surface, as `surface` gives them, of triangles `(t, k)`; none of no triangles."""
+    if not bodies:
+        return read_only(np.zeros((0, 2)), np.int32)
+    triangles = np.concatenate([body.array for body in bodies])
     sides = [[triangles[:, a], triangles[:, b], *triangles.T[3 + k :][:1]] for k, (a, b) in enumerate(EDGES)]
     every = np.stack([np.stack(side, axis=1) for side in sides], axis=1).reshape(-1, 2 + (triangles.shape[1] == 6))
     low, high = np.sort(every[:, :2].astype(np.int64), axis=1).T

@@ -21,8 +21,8 @@ from jax import lax
 from jaxbeam._tree import Numbers, unlock
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
-from jaxbeam.newton import Newton, force_scale, stiffest, topology
-from jaxbeam.scene import Scene, command, evaluate, smallest_jacobian, stencil_hessians
+from jaxbeam.newton import Newton, force_round_off, relative_residual, row_magnitudes, topology
+from jaxbeam.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
 from jaxbeam.solution import check
 from jaxbeam.stability import lowest_mode
 
@@ -148,7 +148,7 @@ def trace_branch(
     length, ended = step, "points"
     while len(points) < max_points:
         old, new = points[-1], advance(points[-1], jnp.asarray(length, dtype))
-        if not float(new.residual) <= solver.tolerance(dtype) or _strays(old, new, length, float(_size(scene))):
+        if not float(new.residual) <= solver.tolerance(dtype) or _strays(old, new, length, float(extent(scene))):
             length /= 2
             if length < 1e-6 * step:
                 ended = "step"
@@ -192,27 +192,24 @@ def _strays(old: Point, new: Point, length: float, size: float) -> bool:
     return bool((jnp.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
 
 
-def _size(scene: Scene) -> jax.Array:
-    return jnp.max(jnp.ptp(scene.mesh.nodes, axis=0))
-
-
 @partial(jax.jit, static_argnames="solver")
 def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: jax.Array, solver: Newton) -> Point:
     """The point of the branch at `length` along the tangent of `here`."""
     rtol = solver.tolerance(here.x.dtype)
     # Inner product of displacements: mean square over the body's size.
-    weight = 1 / (here.x.size * _size(scene) ** 2)
+    weight = 1 / (here.x.size * extent(scene) ** 2)
 
     def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Steps to balance at fixed s, and with s; residual and inertia."""
         scene_at = lambda s: command(scene, 1 + s * (end - 1))
         at = evaluate(scene_at(s), x)
-        storage = assemble(layout, stencil_hessians(scene_at(s), x))
+        hessians = stencil_hessians(scene_at(s), x)
+        storage = assemble(layout, hessians)
         rate = jax.jvp(lambda s: evaluate(scene_at(s), x).gradient, (s,), (jnp.ones_like(s),))[1]
         factor, negative = solver.linear.factor_indefinite(layout, storage)
         gradient = gather(layout, at.gradient)
         solve = lambda v: expand(layout, -solver.linear.solve_indefinite(layout, factor, v), x.shape)
-        residual = jnp.max(jnp.abs(gradient)) / force_scale(stiffest(layout, storage), x, at, rtol)
+        residual = relative_residual(scene, at, force_round_off(row_magnitudes(scene, hessians), x), rtol)
         return solve(gradient), solve(gather(layout, rate)), residual, negative
 
     def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:

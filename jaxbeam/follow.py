@@ -15,9 +15,10 @@ from jax import lax
 
 from jaxbeam._tree import choose
 from jaxbeam.linear import Layout
-from jaxbeam.newton import HALVINGS, INACCURATE, PROJECTED, STEPS, Newton, State, correction, newton, no_factor
+from jaxbeam.newton import HALVINGS, INACCURATE, PROJECTED, STEPS, Newton, State, newton, no_factor
+from jaxbeam.overlap import crossing
 from jaxbeam.predictor import Trail, ahead, extend
-from jaxbeam.scene import Scene, energy, is_valid, ratios_of, worst_element
+from jaxbeam.scene import Scene, energy, extent, is_valid, ratios_of, worst_element
 from jaxbeam.solution import Solution, Status
 
 # Newton steps that the first attempt at a target may take: beyond this a shorter way is quicker. Each failure allows
@@ -123,7 +124,8 @@ def follow(
         free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
         passing = walk.trial < targets[-1] if last else None
         allowed = jnp.where(walk.over, 0, budget)
-        state = newton(scene, layout, walk.start, walk.way, allowed, free, passing, probe, solver)
+        leaving = walk.escapes > 0
+        state = newton(scene, layout, walk.start, walk.way, allowed, free, passing, leaving, probe, solver)
         numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
         attempts, status = counts[3], counts[-1]
         good, saddle, spent_out, may_cut = _judged(walk, state, counts, budget, sound, solver)
@@ -134,7 +136,7 @@ def follow(
         known = state.stiffness.definite & jnp.all(jnp.isfinite(state.aside))
         # The step that is not taken any more still tells where the branch lies, to twice as many digits as `rtol` asks
         # for: a polynomial continued from there does not blow up what was left unbalanced.
-        settled = state.x + jnp.where(known & (correction(state.x, state.step) <= INACCURATE), state.step, 0)
+        settled = state.x + jnp.where(known & (state.correction <= INACCURATE), state.step, 0)
         trail = choose(good, extend(trail, walk.trial, settled, state.aside, walk.way, known), trail)
         kept = jnp.where(good, state.x, walk.kept)
         cut = jnp.where(saddle, walk.increment, 0.5 * (walk.trial - trail.s[0]))
@@ -147,7 +149,7 @@ def follow(
         far = over | (trail.s[0] + 1.01 * increment >= targets[leg])
         leave = saddle & ~over
         trial = jnp.where(leave, walk.trial, jnp.where(far, targets[leg], onward))
-        off = ESCAPE * jnp.max(jnp.abs(state.x)) / jnp.max(jnp.abs(state.aside))
+        off = ESCAPE * extent(scene) / jnp.max(jnp.abs(state.aside))
         way = jnp.where(
             leave, jnp.where(jnp.isfinite(off), off * state.aside, 0), jnp.where(over, 0, ahead(trail, trial))
         )
@@ -181,7 +183,8 @@ def follow(
     row = jnp.minimum(jnp.arange(last + 1, dtype=jnp.int32), walk.leg)
     path = jax.tree.map(lambda all: all[row], walk.path)
     ratios = jax.vmap(lambda s: ratios_of(scene_at(s)))(targets)
-    return _solutions(path, ratios, solver), walk.factor, walk.trail
+    crossed = lax.map(lambda x: crossing(scene_at(targets[0]), x), path.x)
+    return _solutions(path, ratios, crossed, solver), walk.factor, walk.trail
 
 
 class Verdict(NamedTuple):
@@ -207,7 +210,7 @@ def _judged(
     # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
     inverted = (status & Status.INVERTED) != 0
     # So may one that balances with next to no stiffness left, where steps ran out: past a fold a beam creeps by it.
-    creeping = (state.counts[STEPS] >= budget) & (correction(state.x, state.step) > INACCURATE)
+    creeping = (state.counts[STEPS] >= budget) & (state.correction > INACCURATE)
     good = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~walk.over
     return Verdict(good, saddle, spent_out, may_cut)
 
@@ -222,13 +225,14 @@ def _report(
     converged = (state.residual <= solver.tolerance(state.x.dtype)) & ~judging
     finite = jnp.isfinite(state.at.energy) & jnp.all(jnp.isfinite(state.at.gradient))
     volume, element = worst_element(scene, state.x)
-    left = correction(state.x, state.step)
+    left = state.correction
+    vague = state.stiffness.marginal | (state.stiffness.definite & ((left > INACCURATE) | state.singular))
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
         Status.INVERTED: ~(volume > 0),
         Status.UNSTABLE: converged & ~state.stiffness.definite & ~state.stiffness.marginal,
-        Status.INACCURATE: converged & (state.stiffness.marginal | (state.stiffness.definite & (left > INACCURATE))),
+        Status.INACCURATE: converged & vague,
         Status.INVALID: ~sound,
     }
     flags, up = jnp.array([int(flag) for flag in raised], jnp.int32), jnp.stack(list(raised.values()))
@@ -239,9 +243,10 @@ def _report(
     return numbers, jnp.concatenate([spent[:4] + done, jnp.stack([element, status])])
 
 
-def _solutions(path: Report, ratios: jax.Array, solver: Newton) -> Solution:
-    """The solutions, with leading axis, of a path of reports."""
+def _solutions(path: Report, ratios: jax.Array, crossed: jax.Array, solver: Newton) -> Solution:
+    """The solutions, with leading axis, of a path of reports, with the edges `(S, 2, 2)` that cross in each."""
     tolerance = jnp.full(len(ratios), solver.tolerance(path.x.dtype), path.x.dtype)
     numbers = {name: path.numbers[:, k] for k, name in enumerate(NUMBERS)}
     counts = {name: path.counts[:, k] for k, name in enumerate(COUNTS)}
-    return Solution(x=path.x, tolerance=tolerance, ratios=ratios, **numbers, **counts)
+    counts["status"] |= jnp.where(crossed[:, 0, 0] >= 0, int(Status.OVERLAPPING), 0).astype(jnp.int32)
+    return Solution(x=path.x, tolerance=tolerance, crossing=crossed, ratios=ratios, **numbers, **counts)

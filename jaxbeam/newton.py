@@ -5,8 +5,8 @@ a projected Hessian (`jaxbeam.projection`): always projecting would make converg
 true factor exists if and only if the equilibrium is stable.
 
 The residual is relative: the largest unbalanced force on a free coordinate over the *force scale*, the largest
-sum of the magnitudes of the stencil forces that meet at one coordinate. So a change of units changes nothing.
-Forces smaller than round-off can tell apart count as balanced: see `force_scale`.
+sum of the magnitudes of the stencil forces that meet at a free coordinate. So a change of units changes nothing.
+Forces smaller than the round-off at their own coordinate count as balanced: see `relative_residual`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxbeam._tree import blank, choose, key_of, once
 from jaxbeam.chain import Topology
 from jaxbeam.dissection import Automatic
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
-from jaxbeam.scene import Evaluation, Scene, evaluate, largest_step, stencil_hessians
+from jaxbeam.scene import Evaluation, Scene, evaluate, extent, largest_step, stencil_hessians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,17 +66,23 @@ class Newton:
 ARMIJO = 1e-4
 APPROXIMATE = 0.1
 MAX_HALVINGS = 40
-# Round-off of an energy is taken as this many eps times the magnitudes in it; that of the forces is measured to stay
-# between 0.2 and 1.1 eps * stiffness * |x|, in either dtype, for meshes, materials and stiffnesses of all kinds.
-# What is left of a diagonal entry of a singular stiffness when its turn comes: 0.1 to 2.8 eps sqrt(N) of it, on bodies
-# that float free; on slender beams in float32 2.7 and more.
+# Round-off of an energy is taken as this many eps times the magnitudes in it. That of the force at a coordinate is
+# measured to stay under 0.53 eps max|x| times the sum of the magnitudes in its row of the stiffness, for meshes of
+# either order, materials, stiffnesses and slender beams.
+# Pivots of a singular stiffness come out at 0.1 to 2.8 eps sqrt(N) times the diagonal on bodies that float free; on
+# slender beams in float32 at 2.7 and more.
 ENERGY_ROUND_OFF = 4.0
-FORCE_ROUND_OFF = 1.5
+FORCE_ROUND_OFF = 0.75
 PIVOT_ROUND_OFF = 2.0
+SINGULAR = 1.0
 # Share of the projected Hessian tried first where the true one is not definite; tripled until it is one, then
 # shifts are added, each ten times the one before.
 FIRST_SHARE = 0.01
 MAX_BLENDS = 16
+# Shifts tried before any projection on the way from a saddle, each ten times the one before: from ten times the
+# round-off of a pivot to about a millionth of the stiffness, where the lowest eigenvalues of a beam lie. Near a
+# bifurcation the negative eigenvalue is tiny, and the smallest projected share would be thousands of times as stiff.
+GENTLE_SHIFTS = 8
 
 # A step no longer than this, over the size of the body, leaves the stiffness as good as it was: what it changes of
 # the softest mode is as small a share.
@@ -100,20 +106,21 @@ class Stiffness(NamedTuple):
     """The Hessian, as far as it is kept.
 
     `factor` is that of the true one if `definite`, else of one made so; `marginal` if round-off decided which of the
-    two, which leaves its sign open. `largest` `()` is the largest entry of its diagonal.
+    two, which leaves its sign open. `rows` are those of `row_magnitudes`.
     """
 
     factor: Any
     definite: jax.Array
     marginal: jax.Array
-    largest: jax.Array
+    rows: jax.Array
 
 
 class State(NamedTuple):
     """Where Newton's method stands.
 
     `stiffness` is that at `x`. `step` `(n, 2)` is the step to take next and `aside` `(n, 2)` how `x` would move under
-    the probe.
+    the probe. `correction` `()` is the longest move of a node in `step`, over the size of the body. `singular` `()` says that
+    the lowest eigenvalue of the stiffness is within its round-off.
     """
 
     x: jax.Array
@@ -121,6 +128,8 @@ class State(NamedTuple):
     stiffness: Stiffness
     step: jax.Array
     aside: jax.Array
+    correction: jax.Array
+    singular: jax.Array
     residual: jax.Array
     counts: jax.Array
     fresh: jax.Array
@@ -135,6 +144,7 @@ def newton(
     budget: jax.Array,
     free: jax.Array,
     passing: jax.Array | None,
+    leaving: jax.Array,
     probe: Callable[[jax.Array, jax.Array], jax.Array],
     solver: Newton,
 ) -> State:
@@ -144,17 +154,22 @@ def newton(
     need not lower the energy, as long as the true Hessian is positive definite. `probe(x, definite)` are nodal forces
     `(n, 2)` that are solved for beside the unbalanced ones: a column more costs next to nothing.
 
-    The state it ends in holds the stiffness at `x`. Where it is only `passing`, what the last step started from will do
-    if that is no farther than `NEAR`: along a path most states lie there, and it saves them half the work.
+    The state it ends in holds the stiffness at `x`. While `passing`, in an intermediate state of a path, the stiffness
+    at the start of the last step is kept if that step was shorter than `NEAR`: most states of a path end so, and it
+    saves them half the work. `leaving` says that it starts beside a saddle, where shifts are tried before projections.
     """
-    rtol = solver.tolerance(x.dtype)
+    rtol, size = solver.tolerance(x.dtype), extent(scene)
+    # A load on all modes. What it moves tells how soft the softest is.
+    noise = jnp.where(scene.fixed, 0, jnp.asarray(np.random.default_rng(1).choice([-1.0, 1.0], x.shape), x.dtype))
     zero, nothing, yes = jnp.zeros((), x.dtype), jnp.zeros_like(x), jnp.asarray(True)
     first = State(
         x=x,
         at=Evaluation(zero, zero, nothing, nothing),
-        stiffness=Stiffness(no_factor(layout, x.dtype, solver), yes, ~yes, zero),
+        stiffness=Stiffness(no_factor(layout, x.dtype, solver), yes, ~yes, nothing),
         step=ahead,
         aside=nothing,
+        correction=zero,
+        singular=~yes,
         residual=jnp.asarray(jnp.inf, x.dtype),
         counts=jnp.zeros(4, jnp.int32),
         fresh=yes,
@@ -162,7 +177,7 @@ def newton(
     )
 
     def stiffness_at(x: jax.Array, finite: jax.Array) -> Stiffness:
-        return factorise(scene, layout, x, assemble(layout, stencil_hessians(scene, x)), finite, solver)
+        return factorise(scene, layout, x, finite, leaving, solver)
 
     def turned(x: jax.Array, aside: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.jvp(lambda x: evaluate(scene, x).gradient, (x,), (aside,))[1], aside
@@ -171,24 +186,26 @@ def newton(
         bold = state.fresh | (state.stiffness.definite & (state.counts[STEPS] < free))
         x, at, halvings, moved = line_search(scene, state, bold, solver)
         unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, at.gradient)))
-        balanced = unbalanced <= rtol * jnp.max(at.gradient_scale)
-        near = ~state.fresh & (correction(x, state.step) <= NEAR)
+        balanced = unbalanced <= rtol * force_scale(scene, at)
+        near = ~state.fresh & (jnp.max(jnp.abs(state.step)) <= NEAR * size)
         sure = state.stiffness.definite & ~state.stiffness.marginal
         keep = None if passing is None else passing & near & balanced & sure
         renew = True if keep is None else ~keep
         stiffness = once(renew, stiffness_at, state.stiffness, x, jnp.isfinite(unbalanced))
-        residual = unbalanced / force_scale(stiffness.largest, x, at, rtol)
+        round_off = force_round_off(stiffness.rows, x)
+        residual = relative_residual(scene, at, round_off, rtol)
         # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
         rough = ~balanced & (residual < 0.5 * state.residual)
         # What was found with a stiffness that is kept is wrong by as little as that is; it is refined, not found anew.
         held, aside = once(False if keep is None else keep, turned, (nothing, nothing), x, state.aside)
-        pulls = jnp.stack([at.gradient, probe(x, stiffness.definite) + held])
+        pulls = jnp.stack([at.gradient, probe(x, stiffness.definite) + held, noise])
         pulls = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls)
         moves = solver.linear.solve(layout, stiffness.factor, pulls)
         moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
+        left, softest = jnp.max(jnp.abs(moves[0])) / size, _norm(noise) / _norm(moves[2])
         # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
         # mode, and it rounds anew with each step.
-        vague = (residual <= rtol) & (correction(x, moves[0]) > INACCURATE) & (state.counts[POLISHED] < POLISH)
+        vague = (residual <= rtol) & (left > INACCURATE) & (state.counts[POLISHED] < POLISH)
         taken = moved & ~state.fresh
         counted = jnp.stack([taken, taken & ~state.stiffness.definite, halvings, vague], dtype=jnp.int32)
         counts = state.counts + counted
@@ -200,6 +217,8 @@ def newton(
             stiffness=stiffness,
             step=moves[0],
             aside=aside + moves[1],
+            correction=left,
+            singular=softest <= SINGULAR * float(jnp.finfo(x.dtype).eps) * x.size**0.5 * jnp.max(stiffness.rows),
             residual=residual,
             counts=counts,
             fresh=~yes,
@@ -209,9 +228,8 @@ def newton(
     return lax.while_loop(lambda state: state.running, body, first)
 
 
-def correction(x: jax.Array, step: jax.Array) -> jax.Array:
-    """How far a step moves any node, over the size of the body."""
-    return jnp.max(jnp.abs(step)) / jnp.max(jnp.abs(x))
+def _norm(field: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(field**2))
 
 
 def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:
@@ -226,51 +244,79 @@ def stiffest(layout: Layout, storage: jax.Array) -> jax.Array:
     return jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
 
 
-def force_scale(stiffness: jax.Array, x: jax.Array, at: Evaluation, rtol: float) -> jax.Array:
-    """What an unbalanced force is compared with, `()`.
+def force_scale(scene: Scene, at: Evaluation) -> jax.Array:
+    """The largest sum of magnitudes of the stencil forces at one free coordinate, `()`."""
+    return jnp.max(jnp.where(scene.fixed, 0, at.gradient_scale))
 
-    The largest sum of magnitudes of the stencil forces at one coordinate, plus what makes `rtol` times the
-    scale no smaller than the round-off of the forces: positions carry a relative error eps, which the
-    stiffness turns into a force of `eps * max |x| * max K_ii` that no iteration can remove.
+
+def force_round_off(rows: jax.Array, x: jax.Array) -> jax.Array:
+    """Round-off of the force at each coordinate `(n, d)`, from the `rows` of `row_magnitudes`.
+
+    Positions carry a relative error eps, which row `i` of the stiffness turns into a force of up to
+    `eps max |x| sum_j |K_ij|` that no iteration can remove. It is local: a stiff tendon makes the forces on its own
+    nodes uncertain, and no others.
     """
-    round_off = FORCE_ROUND_OFF * jnp.finfo(x.dtype).eps * stiffness * jnp.max(jnp.abs(x))
-    return jnp.max(at.gradient_scale) + round_off / rtol
+    return FORCE_ROUND_OFF * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)) * rows
+
+
+def relative_residual(scene: Scene, at: Evaluation, round_off: jax.Array, rtol: float) -> jax.Array:
+    """The largest unbalanced force on a free coordinate over what it is compared with, `()`.
+
+    That is the force scale, plus what makes `rtol` times it no smaller than the round-off at this coordinate.
+    """
+    compared = force_scale(scene, at) + round_off / rtol
+    # A coordinate without any force at all is in balance.
+    return jnp.max(
+        jnp.where(scene.fixed | (compared == 0), 0, jnp.abs(at.gradient) / jnp.where(compared == 0, 1, compared))
+    )
+
+
+def row_magnitudes(scene: Scene, hessians: list[jax.Array]) -> jax.Array:
+    """Sums `(n, d)` of the magnitudes in each row of the stiffness, taken stencil by stencil."""
+    n, d = scene.mesh.nodes.shape
+    total = jnp.zeros((n, d), scene.mesh.nodes.dtype)
+    for term, hessian in zip(scene.terms, hessians, strict=True):
+        rows = jnp.sum(jnp.abs(hessian), axis=1).reshape(-1, d, hessian.shape[-1])
+        total = total.at[term.nodes].add(jnp.moveaxis(rows, -1, 0))
+    return total
 
 
 def factorise(
-    scene: Scene, layout: Layout, x: jax.Array, storage: jax.Array, finite: jax.Array, solver: Newton
+    scene: Scene, layout: Layout, x: jax.Array, finite: jax.Array, leaving: jax.Array, solver: Newton
 ) -> Stiffness:
-    """A positive definite factor: of the true Hessian if it has one, else of one blended with the projected one.
+    """A positive definite factor: of the true Hessian if it has one, else of one that is blended with the projected
+    Hessian or, when `leaving` a saddle, shifted.
 
     The smallest share of projection that will do is taken: a fully projected Hessian is far too stiff along the soft
     modes of a snap. A projected one that is singular is shifted as well. Returned with it is whether the factor is that
     of the true Hessian; and whether round-off decided that: it is so after a shift by no more, which is tried first, or
     a pivot is no more. One that is not `finite` is tried once.
     """
+    hessians = stencil_hessians(scene, x)
+    storage = assemble(layout, hessians)
     diagonal, largest = storage[layout.diagonal], stiffest(layout, storage)
     noise = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
     finite = finite & jnp.isfinite(largest)
     convex_at = lambda x: assemble(layout, stencil_hessians(scene, x, convex=True))
+    first_blend = jnp.where(leaving, 2 + GENTLE_SHIFTS, 2)
 
     def attempt(carry: Any) -> Any:
         tries, _, _, convex = carry
-        convex = once(tries == 2, convex_at, convex, x)
-        count = tries.astype(storage.dtype)
-        share = jnp.where(tries > 1, jnp.minimum(1.0, FIRST_SHARE * 3.0 ** (count - 2)), 0.0)
-        more = jnp.where(share < 1, 0.0, 10.0 ** (count - 18)) * largest
-        blend = (
-            ((1 - share) * storage + share * convex)
-            .at[layout.diagonal]
-            .add(jnp.where(tries == 1, noise * largest, more))
-        )
+        convex = once(tries == first_blend, convex_at, convex, x)
+        count = (tries - first_blend).astype(storage.dtype)
+        share = jnp.where(count >= 0, jnp.minimum(1.0, FIRST_SHARE * 3.0**count), 0.0)
+        gentle = jnp.where(tries > 0, noise * 10.0 ** (tries - 1).astype(storage.dtype), 0.0)
+        shift = jnp.where(count < 0, gentle, jnp.where(share < 1, 0.0, 10.0 ** (count - 16))) * largest
+        blend = ((1 - share) * storage + share * convex).at[layout.diagonal].add(shift)
         factor, done = solver.linear.factor(layout, blend)
         return tries + 1, factor, done, convex
 
     begin = (jnp.zeros((), jnp.int32), no_factor(layout, storage.dtype, solver), ~finite, jnp.zeros_like(storage))
-    going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] <= MAX_BLENDS + 1))
+    going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] < first_blend + MAX_BLENDS))
     tries, factor, done, _ = lax.while_loop(going, attempt, begin)
     blunt = jnp.min(solver.linear.pivots(layout, factor) / diagonal) <= PIVOT_ROUND_OFF * noise
-    return Stiffness(factor, done & (tries == 1), done & ((tries == 2) | ((tries == 1) & blunt)), largest)
+    marginal = done & ((tries == 2) | ((tries == 1) & blunt))
+    return Stiffness(factor, done & (tries == 1), marginal, row_magnitudes(scene, hessians))
 
 
 def line_search(

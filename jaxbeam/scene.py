@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
+from jaxbeam._tree import Numbers, index_field, is_concrete, key_of, namespace, pytree, read_only, replace, to_device
+from jaxbeam.anchors import surface_of
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, check_length, middle_column, rectangle, with_middles
 from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
@@ -43,6 +44,8 @@ class Scene:
             eliminated from the unknowns.
         tip: `(q,)` node numbers of the end section that the tip measures follow; may be empty.
 
+    Besides, `surface` `(e, 2)` or `(e, 3)` holds the edges of the surface of its solids (see `jaxbeam.anchors`).
+
     Raises:
         ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a term's node is out of range,
             or a term of solids acts on a rod.
@@ -52,6 +55,7 @@ class Scene:
     terms: tuple[Term, ...]
     fixed: np.ndarray = index_field()
     tip: np.ndarray = index_field(default_factory=lambda: np.zeros(0, np.int32))
+    surface: np.ndarray = index_field(init=False)
 
     def __post_init__(self) -> None:
         shape = self.mesh.nodes.shape
@@ -78,6 +82,8 @@ class Scene:
             tip = check_nodes("tip", self.mesh, tip, ndim=1)
         object.__setattr__(self, "fixed", read_only(fixed))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
+        bodies = tuple(key_of(term, "nodes") for term in self.terms if isinstance(term.energy, SolidEnergy))
+        object.__setattr__(self, "surface", surface_of(bodies))
 
 
 def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
@@ -284,6 +290,11 @@ def rod_terms(scene: Scene) -> list[Term]:
 
 
 # ------------------------------------------------------------------------- energy, forces, Hessians
+
+
+def extent(scene: Scene) -> jax.Array:
+    """The size of the body `()`: its largest extent at rest, wherever it lies."""
+    return jnp.max(jnp.ptp(scene.mesh.nodes, axis=0))
 
 
 class Evaluation(NamedTuple):

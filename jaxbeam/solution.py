@@ -20,6 +20,7 @@ class Status(enum.IntFlag):
     UNSTABLE = 8
     INVALID = 16
     INACCURATE = 32
+    OVERLAPPING = 64
 
 
 REMEDIES = {
@@ -34,6 +35,8 @@ REMEDIES = {
     Status.INACCURATE: "forces balance to round-off, but that leaves positions uncertain by more than a thousandth of "
     "the body (see correction), or whether the equilibrium is stable: use float64; in float64 the command is at a "
     "limit of stability, such as a fold, where no derivative exists: see lowest_mode",
+    Status.OVERLAPPING: "the body passes through itself, and nothing here models that contact: two edges of its surface "
+    "cross (see crossing); command less, or start from another state",
     Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
     "(-1, 0.5), all finite): build the scene outside jit to be told which",
 }
@@ -51,7 +54,7 @@ class Solution:
     energy: `()` total energy.
     residual: `()` largest unbalanced force on a free coordinate, over the force scale.
     tolerance: `()` what the residual had to reach.
-    correction: `()` what one more Newton step would move, over the size of the body: how far round-off leaves
+    correction: `()` what one more Newton step would move a node, over the size of the body: how far round-off leaves
         `x` from the equilibrium, along its softest directions.
     steps: `()` Newton steps taken, all attempts together.
     projected: `()` how many of them used projected Hessians.
@@ -59,6 +62,7 @@ class Solution:
     attempts: `()` Newton solves; more than 1 when a first one failed or ended on a saddle.
     smallest_jacobian: `()` smallest `J = det F` over the solids; infinite without one.
     worst_element: `()` the element where it is.
+    crossing: `(2, 2)` int32, two edges of the surface that cross, each by the numbers of its end nodes; -1 if none do.
     ratios: `(m,)` commanded ratio of each tendon.
     reached: `()` how far `x` got: 1 at the command itself; less where the way to it broke off, and then `x`
         is the equilibrium at that fraction of the way.
@@ -76,6 +80,7 @@ class Solution:
     attempts: jax.Array
     smallest_jacobian: jax.Array
     worst_element: jax.Array
+    crossing: jax.Array
     ratios: jax.Array
     reached: jax.Array
     status: jax.Array
@@ -120,6 +125,10 @@ def _describe(solution: Solution, member: int) -> str:
         f"Newton steps in {of(solution.attempts)} attempts, smallest J {of(solution.smallest_jacobian):.3g} in element "
         f"{of(solution.worst_element)}"
     )
+    crossing = of(solution.crossing, 2)
+    if (crossing >= 0).all():
+        (a, b), (c, d) = crossing
+        text += f", surface edge {a}-{b} crosses {c}-{d}"
     ratios = of(solution.ratios, 1)
     if ratios.size:
         text += f", command {[float(f'{r:.6g}') for r in ratios]}"

@@ -31,7 +31,7 @@ from jaxbeam.linear import Layout, expand, gather
 from jaxbeam.newton import Newton, topology
 from jaxbeam.predictor import STATES, Trail, ahead
 from jaxbeam.scene import Scene, command, energy, partway
-from jaxbeam.solution import Solution
+from jaxbeam.solution import Solution, Status
 
 # Commands of a chunk, and the numbers that its states and tangents may take (half a gigabyte).
 CHUNK = 128
@@ -132,12 +132,13 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
             parent, _, _ = carry
             found = _continue(scene, layout, chunk, lane, parent, solver)
             # One that fails is begun again at rest.
-            again = (found.solution.status != 0) & (parent != size)
+            again = ((found.solution.status & ~Status.OVERLAPPING) != 0) & (parent != size)
             return jnp.where(again, size, parent), again, found
 
         begin = (nearest, jnp.asarray(True), nothing)
         parent, _, found = lax.while_loop(lambda c: c[1], attempt, begin)
-        good = found.solution.status == 0
+        # A body that overlaps itself is an equilibrium to go on from.
+        good = (found.solution.status & ~Status.OVERLAPPING) == 0
         back = chunk.anchor[parent]
         near = chunk.known[back] & (jnp.sum((chunk.ratios[parent] - chunk.ratios[back]) ** 2) < GAP**2)
         anchor = jnp.where(found.joined, jnp.where(near, back, parent), size)
