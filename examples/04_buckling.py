@@ -18,8 +18,9 @@ where it happens to be. At -3.4 degrees the unbalanced force is still 23.6; the 
 
 Nor is that the only stable equilibrium at (0.4, 0.4). Others are found by search: commands drawn at random, with a
 fixed seed, from [0.2, 1.0] for either tendon, are solved from rest in one jump, and from each state the beam jumps to
-(0.4, 0.4). What is found is listed by energy; a search shows what exists, never that there is no more. Nothing
-keeps the body from passing through itself: the folded states are equilibria of this model, not of a real beam.
+(0.4, 0.4). What is found is listed by energy; a search shows what exists, never that there is no more. In most of
+these states the body passes through itself: they are equilibria of this model, which knows no contact, and not of a
+real beam. Their status is `OVERLAPPING`, and the list says so.
 """
 
 import argparse
@@ -59,7 +60,7 @@ def trace(scene: jb.Scene, **start: Any) -> jb.Branch:
     branch = jb.trace_branch(scene, END, solver=SOLVER, progress=progress, **start)
     inverted = np.flatnonzero(branch.smallest_jacobian <= 0)
     end = int(inverted[0]) if inverted.size else len(branch.x)
-    names = ("parameter", "ratios", "x", "negative", "residual", "smallest_jacobian")
+    names = ("parameter", "ratios", "x", "negative", "residual", "smallest_jacobian", "overlapping")
     parts = {name: getattr(branch, name)[:end] for name in names}
     return dataclasses.replace(branch, **parts, critical=tuple(c for c in branch.critical if c.after < end - 1))
 
@@ -85,7 +86,7 @@ def join(scene: jb.Scene, fork: jb.Critical, back: jb.Branch, onward: jb.Branch)
     angles = np.array([float(tip_angle(scene, jnp.asarray(x))) for x in back.x])
     count = int(np.argmax(angles * np.sign(angles[0]) < 0)) or len(angles)
     first = {"parameter": fork.parameter, "ratios": fork.ratios, "x": fork.x, "negative": 1, "residual": 0.0}
-    first["smallest_jacobian"] = float(jb.smallest_jacobian(scene, fork.x))
+    first |= {"smallest_jacobian": float(jb.smallest_jacobian(scene, fork.x)), "overlapping": False}
     parts: dict[str, Any] = {
         name: np.concatenate([np.asarray(value)[None], getattr(back, name)[1:count][::-1], getattr(onward, name)])
         for name, value in first.items()
@@ -107,11 +108,12 @@ def pull(scene: jb.Scene) -> tuple[np.ndarray, np.ndarray]:
 def search(scene: jb.Scene) -> list[tuple[jb.Solution, np.ndarray, int]]:
     """Stable equilibria at `GOAL` by energy, each with a command it was reached from, and how often it was."""
     found: dict[float, tuple[jb.Solution, np.ndarray, int]] = {}
+    balanced = lambda solution: int(solution.status) in (jb.Status.OK, jb.Status.OVERLAPPING)
     goal = jb.command(scene, GOAL)
     for count, ratios in enumerate(np.random.default_rng(SEED).uniform(0.2, 1.0, (SEARCHES, 2)), 1):
         first = jb.equilibrium(jb.command(scene, ratios), None, SOLVER)
-        state = jb.equilibrium(goal, first.x, SOLVER) if int(first.status) == 0 else first
-        if int(first.status) == 0 and int(state.status) == 0:
+        state = jb.equilibrium(goal, first.x, SOLVER) if balanced(first) else first
+        if balanced(first) and balanced(state):
             key = round(float(state.energy), 6)
             known = found.get(key, (state, ratios, 0))
             found[key] = (*known[:2], known[2] + 1)
@@ -245,13 +247,15 @@ def main(out: Path) -> dict[str, float]:
     print("\npulling the one-sided beam, and searching at (0.4, 0.4) ...", flush=True)
     pulled = pull(lopsided)
     found = search(lopsided)
-    print("\nstable equilibria at (0.4, 0.4)\n  energy        tip angle, deg   smallest J   found   first from")
+    print(
+        "\nstable equilibria at (0.4, 0.4)\n  energy        tip angle, deg   smallest J   found   first from       status"
+    )
     for state, ratios, count in found:
         angle = float(tip_angle(lopsided, state.x))
         mark = "   <- pulled in steps" if abs(angle - pulled[1][-1]) < 1e-6 else ""
         print(
             f"  {float(state.energy):11.5f}  {angle:+13.5f}   {float(state.smallest_jacobian):10.4f}   {count:5}   "
-            f"({ratios[0]:.3f}, {ratios[1]:.3f}){mark}"
+            f"({ratios[0]:.3f}, {ratios[1]:.3f})   {jb.Status(int(state.status)).name}{mark}"
         )
     numbers |= {"pulled in steps": float(pulled[1][-1]), "lowest energy": float(found[0][0].energy)}
 
@@ -262,7 +266,8 @@ def main(out: Path) -> dict[str, float]:
     figure.savefig(out / "modes.png", dpi=200)
     print(f"bending eigenvalue: {bending[0]:.3f} at first, {bending[1]:.3f} at ratio {bending[2]:.3f}, its highest")
     print("drawing equilibria.png ...", flush=True)
-    titles = [f"{float(tip_angle(lopsided, s.x)):+.2f}°, energy {float(s.energy):.1f}" for s, _, _ in found]
+    kinds = ["overlapping" if int(s.status) else f"energy {float(s.energy):.1f}" for s, _, _ in found]
+    titles = [f"{float(tip_angle(lopsided, s.x)):+.2f}°, {kind}" for (s, _, _), kind in zip(found, kinds, strict=True)]
     states = plot.States(lopsided, np.tile(GOAL, (len(found), 1)), np.stack([s.x for s, _, _ in found]))
     plot.gallery(states, titles).savefig(out / "equilibria.png", dpi=200)
     print(f"pictures are in {out}")

@@ -22,8 +22,9 @@ from jaxbeam._tree import Numbers, unlock
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
 from jaxbeam.newton import Newton, force_round_off, relative_residual, row_magnitudes, topology
+from jaxbeam.overlap import crossing
 from jaxbeam.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
-from jaxbeam.solution import check
+from jaxbeam.solution import Status, check
 from jaxbeam.stability import lowest_mode
 
 # Corrections per step; a step that needs more than a few is followed by a shorter one.
@@ -56,6 +57,7 @@ class Branch:
     parameter: `(P,)` position `s` on the way from ratio 1 to the command. ratios: `(P, m)`. x: `(P, n, 2)`.
     negative: `(P,)` negative eigenvalues of the tangent stiffness; stable where it is 0.
     residual: `(P,)` relative, as in `Solution`. smallest_jacobian: `(P,)`.
+    overlapping: `(P,)` booleans, true where the body passes through itself.
     critical: the folds and bifurcations on it, in order.
     ended: why it ends: `"left"` (the interval), `"points"` (as many as allowed) or `"step"` (it could not go on).
     """
@@ -66,6 +68,7 @@ class Branch:
     negative: np.ndarray
     residual: np.ndarray
     smallest_jacobian: np.ndarray
+    overlapping: np.ndarray
     critical: tuple[Critical, ...]
     ended: str
 
@@ -137,7 +140,8 @@ def trace_branch(
     begin = dataclasses.replace(solver, escape=False)
     at_start = command(scene, 1 + parameter * (end - 1))
     found = equilibrium(at_start, x0, begin)
-    if found.status & ~8:
+    # A saddle, a critical point or a body that overlaps itself lies on a branch as well as any other state.
+    if found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID):
         check(found)
     data = unlock(scene)
     advance = partial(_advance, data, layout, end, solver=solver)
@@ -173,6 +177,7 @@ def trace_branch(
         negative=stack("negative"),
         residual=stack("residual"),
         smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(scene, y))(jnp.asarray(x))),
+        overlapping=np.asarray(lax.map(lambda y: crossing(scene, y)[0, 0] >= 0, jnp.asarray(x))),
         critical=tuple(critical),
         ended=ended,
     )

@@ -119,8 +119,8 @@ class State(NamedTuple):
     """Where Newton's method stands.
 
     `stiffness` is that at `x`. `step` `(n, 2)` is the step to take next and `aside` `(n, 2)` how `x` would move under
-    the probe. `correction` `()` is the longest move of a node in `step`, over the size of the body. `singular` `()` says that
-    the lowest eigenvalue of the stiffness is within its round-off.
+    the probe. `correction` `()` is the longest move of a node in `step`, over the size of the body. `singular` `()` is
+    true where the lowest eigenvalue of the stiffness is within its round-off.
     """
 
     x: jax.Array

@@ -43,7 +43,7 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def _of_solids(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Segments of the surface: their points `(s, 2, 2)`, numbers `(s, 2)` of these, and ends `(s, 2)` of their edges."""
+    """Segments of the surface: points `(s, 2, 2)`, the numbers `(s, 2)` of these, and the ends `(s, 2)` of its edge."""
     edges = jnp.asarray(scene.surface)
     parts = 1 if edges.shape[1] == 2 else SEGMENTS
     xi = np.linspace(0, 1, parts + 1)

@@ -35,8 +35,8 @@ REMEDIES = {
     Status.INACCURATE: "forces balance to round-off, but that leaves positions uncertain by more than a thousandth of "
     "the body (see correction), or whether the equilibrium is stable: use float64; in float64 the command is at a "
     "limit of stability, such as a fold, where no derivative exists: see lowest_mode",
-    Status.OVERLAPPING: "the body passes through itself, and nothing here models that contact: two edges of its surface "
-    "cross (see crossing); command less, or start from another state",
+    Status.OVERLAPPING: "the body passes through itself, and nothing here models that contact: two edges of its "
+    "surface cross (see crossing); command less, or start from another state",
     Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
     "(-1, 0.5), all finite): build the scene outside jit to be told which",
 }

@@ -418,7 +418,7 @@ def test_load_beyond_the_material_is_inverted():
 def test_status_is_a_flag():
     assert jb.Status.OK == 0
     assert not jb.Status(0)
-    assert [int(flag) for flag in jb.Status] == [1, 2, 4, 8, 16, 32]
+    assert [int(flag) for flag in jb.Status] == [1, 2, 4, 8, 16, 32, 64]
 
 
 # --------------------------------------------------------------------------------------- check
