@@ -3,7 +3,7 @@
 Numbers that are known are checked on the host. Of traced ones only the shape and the dtype are known; where a value
 turns out to lie outside its range it becomes NaN, which spreads to the parameters made of it, and a scene with such a
 parameter is solved with the status `INVALID`. So what is refused when it is concrete is `INVALID` when it is traced.
-Derivatives by values in their range pass through.
+Derivatives by values in their range pass through; by others they are NaN.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def inside(name: str, array: Any, within: Range, words: str = "", why: str = "")
     """Real numbers as `real` returns them, within a range."""
     if isinstance(array, Tracer):
         floats = array if array.dtype.kind == "f" else array.astype(jnp.result_type(float))
-        return jnp.where(within.holds(floats), floats, jnp.nan)
+        return poisoned(floats, within.holds(floats))
     good = within.holds(array)
     if not good.all():
         k = tuple(map(int, np.unravel_index(int(np.argmin(good)), array.shape)))
@@ -101,6 +101,11 @@ def inside(name: str, array: Any, within: Range, words: str = "", why: str = "")
         reason = f"; {why}" if why else ""
         raise ValueError(f"{name}: expected {words or within.many}, got {got}{reason}")
     return array
+
+
+def poisoned(values: jax.Array, good: jax.Array) -> jax.Array:
+    """Traced values where they are good, elsewhere NaN, and so are their derivatives: zero would pass for an answer."""
+    return values * jnp.where(good, 1.0, jnp.nan)
 
 
 def shaped(name: str, value: Any, shapes: tuple[Shape, ...] | None, each: str = "") -> Any:

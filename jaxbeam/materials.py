@@ -45,12 +45,12 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
         ValueError: if concrete values are outside their range, or both are arrays of different shapes. A traced value
             outside its range becomes NaN.
     """
-    young = numbers("young", young, POSITIVE, why="a stiffness is positive")
-    poisson = numbers("poisson", poisson, POISSON, why="0.5 is incompressible, where lam is infinite: use 0.4999, say")
-    if () not in (young.shape, poisson.shape) and young.shape != poisson.shape:
-        raise ValueError(f"poisson: expected a scalar or the shape of young, {young.shape}, got {poisson.shape}")
-    xp, dtype = namespace(young, poisson), jnp.result_type(float)
-    E, nu = xp.asarray(young, dtype), xp.asarray(poisson, dtype)
+    E = numbers("young", young, POSITIVE, why="a stiffness is positive")
+    nu = numbers("poisson", poisson, POISSON, why="0.5 is incompressible, where lam is infinite: use 0.4999, say")
+    if () not in (E.shape, nu.shape) and E.shape != nu.shape:
+        raise ValueError(f"poisson: expected a scalar or the shape of young, {E.shape}, got {nu.shape}")
+    xp, dtype = namespace(E, nu), jnp.result_type(float)
+    E, nu = xp.asarray(E, dtype), xp.asarray(nu, dtype)
     return Lame(to_device(E / (2 * (1 + nu))), to_device(E * nu / ((1 + nu) * (1 - 2 * nu))))
 
 
@@ -152,6 +152,10 @@ def check_density(density: Callable[[jax.Array, Any], jax.Array], material: Any)
     """
     function("density", density, "(H, params) -> scalar")
     if density in _OWN:
+        if not all(hasattr(getattr(material, name, None), "shape") for name in ("mu", "lam")):
+            raise ValueError(
+                f"params: expected the mu and lam of {density.__name__}, such as lame(young, poisson), got {material!r}"
+            )
         return
     leaves, structure = jax.tree.flatten(material)
     first = tuple(np.asarray(leaf)[0] if is_concrete(leaf) else np.ones(leaf.shape[1:], leaf.dtype) for leaf in leaves)

@@ -53,7 +53,7 @@ class Mesh:
         else:
             _surface_of(elements)
             upright = _areas(nodes, elements) > SLIVER * jnp.max(jnp.ptp(nodes, axis=0)) ** 2
-            nodes = jnp.where(jnp.all(upright), nodes, jnp.nan)
+            nodes = checks.poisoned(nodes, jnp.all(upright))
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
 

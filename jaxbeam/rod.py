@@ -82,7 +82,7 @@ class Line(Mesh):
             _check_line(np.asarray(nodes, float), elements, float(radian))
         else:
             length, along, _ = _run(nodes, elements, radian)
-            nodes = jnp.where(jnp.all(along > ALIGNED * length), nodes, jnp.nan)
+            nodes = checks.poisoned(jnp.asarray(nodes), jnp.all(along > ALIGNED * length))
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
         object.__setattr__(self, "radian", radian)

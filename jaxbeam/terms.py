@@ -278,8 +278,8 @@ def tendons(
     modulus = checks.numbers("modulus", modulus, checks.POSITIVE, ((), lines.shape[:1]))
     if not is_concrete(width):
         raise ValueError("width: expected known numbers, got traced ones; the nodes of a patch depend on its width")
-    width = checks.numbers("width", width, checks.NOT_NEGATIVE, ((), lines.shape))
-    widths = np.broadcast_to(width.astype(float), lines.shape)
+    tents = checks.numbers("width", width, checks.NOT_NEGATIVE, ((), lines.shape))
+    widths = np.broadcast_to(tents.astype(float), lines.shape)
     dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
     anchored: tuple[np.ndarray, ...] = ()
     if not widths.any():
