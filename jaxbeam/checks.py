@@ -123,13 +123,13 @@ def shaped(name: str, value: Any, shapes: tuple[Shape, ...] | None, each: str = 
 
 def real(name: str, value: Any, expected: str = "real numbers") -> Any:
     """What was passed as a NumPy array of floats or whole numbers; traced values as a JAX array."""
-    array = _array(name, value, expected)
+    array = plain(name, value, expected)
     if array.dtype.kind not in "fiu" or (array.dtype.itemsize < 4 and array.dtype.kind == "f"):
         raise ValueError(f"{name}: expected {expected}, got {_shown(value, array)}; {_cure(array.dtype)}")
     return array
 
 
-def _array(name: str, value: Any, expected: str) -> Any:
+def plain(name: str, value: Any, expected: str) -> Any:
     """What was passed as an array of any dtype."""
     if isinstance(value, Tracer):
         return value
@@ -199,7 +199,7 @@ def scalar(name: str, form: str, value: Any, *arguments: Any) -> None:
 
 def parameter(name: str, value: Any) -> Any:
     """A leaf of the parameters of a term: numbers, or booleans, that can be computed with."""
-    array = value if isinstance(value, jax.Array | np.ndarray) else _array(name, value, "numbers")
+    array = value if isinstance(value, jax.Array | np.ndarray) else plain(name, value, "numbers")
     if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub" or array.dtype in (np.float16,):
         real(name, value)
     return array
@@ -236,7 +236,7 @@ def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
     shape = "(m,)" if ndim == 1 else "(m, k)"
     cure = "" if ndim == 1 else "; rows of different lengths, as of tendons with more guides, are terms of their own"
     try:
-        array = _array(name, value, f"whole numbers of shape {shape}")
+        array = plain(name, value, f"whole numbers of shape {shape}")
     except ValueError as error:
         raise ValueError(f"{error}{cure}") from None
     if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
@@ -251,7 +251,7 @@ def whole_numbers(name: str, value: Any, shape: str, columns: tuple[int, ...]) -
     """Rows of whole numbers, at least one, with one of these numbers of columns: an array fit to be structure."""
     if not is_concrete(value):
         raise ValueError(f"{name}: expected concrete node numbers, got a traced array; build the topology outside")
-    array = _array(name, value, f"whole numbers of shape {shape}")
+    array = plain(name, value, f"whole numbers of shape {shape}")
     if array.dtype.kind not in "iu":
         raise ValueError(f"{name}: expected whole numbers, got dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] not in columns or not len(array):

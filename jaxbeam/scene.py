@@ -62,7 +62,7 @@ class Scene:
         shape = self.mesh.nodes.shape
         if not is_concrete(self.fixed, self.tip):
             raise ValueError("fixed, tip: expected concrete arrays, got traced ones; choose nodes outside jit and grad")
-        fixed = np.asarray(self.fixed)
+        fixed = checks.plain("fixed", self.fixed, f"booleans of shape {shape}")
         if fixed.shape != shape or fixed.dtype != bool:
             raise ValueError(
                 f"fixed: expected booleans of shape {shape}, got shape {fixed.shape} of dtype {fixed.dtype}; "
@@ -81,9 +81,7 @@ class Scene:
             )
             if isinstance(self.mesh, Line) and of_solids:
                 raise ValueError(f"terms[{number}]: it is made for solids; on a Line use rod and rod_tendons")
-        tip = np.asarray(self.tip)
-        if tip.size:
-            tip = check_nodes("tip", self.mesh, tip, ndim=1)
+        tip = check_nodes("tip", self.mesh, self.tip, ndim=1) if np.size(self.tip) else np.zeros(0)
         object.__setattr__(self, "fixed", read_only(fixed))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
 

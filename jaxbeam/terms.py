@@ -47,10 +47,11 @@ class Term:
     def __post_init__(self) -> None:
         if not callable(self.energy):
             raise ValueError(f"energy: expected a function (x, params) -> scalar, got {self.energy!r}")
-        nodes = np.asarray(self.nodes) if is_concrete(self.nodes) else None
+        wanted = "concrete whole numbers of shape (m, k)"
+        nodes = checks.plain("nodes", self.nodes, wanted) if is_concrete(self.nodes) else None
         if nodes is None or nodes.dtype.kind not in "iu" or nodes.ndim != 2 or 0 in nodes.shape:
             got = "a traced array" if nodes is None else f"shape {nodes.shape} of dtype {nodes.dtype}"
-            raise ValueError(f"nodes: expected concrete whole numbers of shape (m, k), got {got}")
+            raise ValueError(f"nodes: expected {wanted}, got {got}")
         object.__setattr__(self, "nodes", read_only(nodes, np.int32))
         named = lambda path, leaf: checks.parameter(f"params{jax.tree_util.keystr(path)}", leaf)
         params = jax.tree.map(to_device, jax.tree_util.tree_map_with_path(named, self.params))
@@ -143,7 +144,8 @@ def solid(
     material = jax.tree_util.tree_map_with_path(per_element, params)
     check_density(density, material)
     rest = xp.asarray(mesh.nodes)[mesh.elements]
-    points, shares = rule((1 if rest.shape[1] == 3 else 2) if degree is None else degree)
+    usual = 1 if rest.shape[1] == 3 else 2
+    points, shares = rule(usual if degree is None else checks.count("degree", degree, 1))
     # How a triangle is mapped from the reference one, and the inverse of that, at each point.
     slopes = xp.asarray(shape_slopes(rest.shape[1], points), dtype)
     map_ = xp.einsum("mkd,qki->mqdi", rest, slopes)

@@ -190,6 +190,13 @@ REFUSED = {
     "text to grade": (lambda: jb.tendon_beam(5, 3, graded="yes"), "graded: expected True or False, got 'yes'"),
     "true order": (lambda: jb.rectangle(1.0, 1.0, 3, 3, order=True), r"order: expected 1 .* got True"),
     "no diagonals": (lambda: jb.rectangle(1.0, 1.0, 3, 3, None), "diagonals: expected 'one-sided', .* got None"),
+    "true leaf": (lambda: jb.NestedDissection(leaf=True), "leaf: expected a whole number of at least 1, got True"),
+    "text to join": (lambda: jb.NestedDissection(join="no"), "join: expected True or False, got 'no'"),
+    "true block": (lambda: jb.BlockTridiagonal(True), "joined: expected a whole number of at least 0, got True"),
+    "true degree": (
+        lambda: jb.tendon_beam(5, 3, degree=True),
+        "degree: expected a whole number of at least 1",
+    ),
     "half dtype": (lambda: jb.tendon_beam(5, 3, dtype=jnp.float16), "dtype: expected float32 or float64, got"),
     "whole dtype": (lambda: jb.rod_beam(5, dtype=int), "dtype: expected float32 or float64, got <class 'int'>"),
     "true count": (lambda: jb.lowest_mode(BEAM, REST, True), "count: expected a whole number from 1 to 24, .*got True"),
@@ -247,6 +254,18 @@ REFUSED = {
         "nodes: .*; rows of different lengths, as of te",
     ),
     "masked elements": (lambda: jb.Mesh(SQUARE, np.ma.masked_array([[0, 1, 2]])), "elements: .* got a masked array"),
+    "masked clamp": (
+        lambda: jb.Scene(MESH, (BODY,), np.ma.masked_array(jb.clamped(MESH, [0]))),
+        "fixed: expected booleans of shape .* got a masked array",
+    ),
+    "masked tip": (
+        lambda: jb.Scene(MESH, (BODY,), jb.clamped(MESH, [0, 1]), np.ma.masked_array([4])),
+        "tip: .* got a masked array",
+    ),
+    "ragged stencils": (
+        lambda: jb.Term(loose_edge, [[0, 1], [2]], np.ones(2)),
+        "nodes: expected concrete whole num",
+    ),
     "whole JAX nodes": (
         lambda: jb.Mesh(jnp.zeros((3, 2), int), [[0, 1, 2]]),
         "nodes: expected floats, got dtype int64",
