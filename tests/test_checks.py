@@ -1,5 +1,7 @@
 """Bad input: refused in a sentence that names the argument when it is concrete, `INVALID` when it is traced."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -341,7 +343,7 @@ REFUSED = {
         r"poisson: expected a value in \(-1",
     ),
 }
-SOLUTION = jb.Solution(*[REST] * 14)
+SOLUTION = jb.Solution(*[REST] * len(dataclasses.fields(jb.Solution)))
 # Two springs in line, pushed: the node between them is at a saddle.
 SADDLE_MESH = jb.Mesh(np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]), [[0, 3, 2], [3, 1, 2]])
 PAIR = jb.tendons(SADDLE_MESH, [[0, 2], [2, 1]], 3.0, jb.constant_stiffness)
