@@ -82,7 +82,7 @@ def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Arr
 
     Raises:
         ValueError: if a piece of the mesh is not held, or the scene is not stable at rest: then a small command or load
-            does not lead to a state near rest. Inside jit the answer is NaN then.
+            does not lead to a state near rest. Inside jit free coordinates are NaN then.
     """
     check_scene(scene)
     check_linear("linear", linear)
@@ -98,11 +98,11 @@ def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Arr
 
 @compiled("linear")
 def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array]:
-    """The positions, NaN unless the stiffness at rest is positive definite, and whether it is."""
+    """The positions, and whether the stiffness at rest is positive definite; if it is not, its factor makes them NaN."""
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
     step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
-    return jnp.where(stable, rest - expand(layout, step, rest.shape), jnp.nan), stable
+    return rest - expand(layout, step, rest.shape), stable
 
 
 @compiled("solver")
