@@ -98,7 +98,7 @@ def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Arr
 
 @compiled("linear")
 def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array]:
-    """The positions, and whether the stiffness at rest is positive definite; if it is not, its factor makes them NaN."""
+    """The positions, and whether the stiffness at rest is positive definite: if not, its factor makes them NaN."""
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
     step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
