@@ -22,14 +22,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam import checks
 from jaxbeam._tree import compiled, is_concrete, replace, unlock
 from jaxbeam.anchors import surface
 from jaxbeam.elements import degree_of
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
 from jaxbeam.mesh import Finer, Mesh, cut_in_four, with_middle_nodes
-from jaxbeam.newton import Newton, topology
-from jaxbeam.scene import Scene, evaluate, stencil_hessians
+from jaxbeam.newton import Newton, check_asked, topology
+from jaxbeam.scene import Scene, check_scene, evaluate, stencil_hessians
 from jaxbeam.solution import Solution
 from jaxbeam.terms import SolidEnergy, TendonEnergy, Term, solid, tendons
 
@@ -95,6 +96,9 @@ def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: N
     Raises:
         ValueError: if the scene is traced or has no triangles, or the measure returns anything but a scalar.
     """
+    check_asked(scene, solver)
+    checks.instance("solution", solution, Solution, "give what equilibrium(scene) returned")
+    checks.function("measure", measure, "(scene, x) -> scalar")
     return _estimate(scene, solution, measure, solver)[0]
 
 
@@ -112,10 +116,12 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         solver: settings.
 
     Raises:
-        ValueError: if the tolerance is not positive, or as `estimate_error` does.
+        ValueError: if the tolerance is not positive and finite, or as `estimate_error` does.
     """
-    if not tolerance > 0:
-        raise ValueError(f"tolerance: expected a positive number, in the unit of the measure, got {tolerance!r}")
+    check_asked(scene, solver)
+    checks.function("measure", measure, "(scene, x) -> scalar")
+    tolerance = checks.setting("tolerance", tolerance, checks.POSITIVE, "it is in the unit of the measure")
+    checks.count("most", most, 1)
     rung, start = 0, None
     while True:
         solution = equilibrium(scene, start, solver)
@@ -136,6 +142,7 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     Raises:
         ValueError: if the scene is traced or its mesh has no triangles.
     """
+    check_scene(scene)
     if not is_concrete(*jax.tree.leaves(scene)):
         raise ValueError("scene: expected concrete numbers to refine a mesh of, got traced ones; call outside jit")
     elements, count = scene.mesh.elements, scene.mesh.nodes.shape[0]

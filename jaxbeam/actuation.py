@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxbeam._tree import Numbers, compiled, is_concrete, namespace, to_device, unlock
+from jaxbeam import checks
+from jaxbeam._tree import Numbers, compiled, is_concrete, to_device, unlock
 from jaxbeam.equilibrium import differentiable_rows
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout
-from jaxbeam.newton import Newton, topology
+from jaxbeam.newton import Newton, check_asked, topology
 from jaxbeam.predictor import begin
 from jaxbeam.scene import Scene, command
 from jaxbeam.solution import Solution
@@ -22,24 +23,19 @@ def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
     """The commands `(steps, m)` of a ramp: evenly spaced from ratio 1 to `ratios` `(m,)`.
 
     Raises:
-        ValueError: if `steps` is not a whole number of at least 2.
+        ValueError: if `steps` is not a whole number of at least 2, or a concrete ratio is not positive and finite.
 
     >>> [float(r) for r in commands([0.5], steps=3)[:, 0]]
     [1.0, 0.75, 0.5]
     """
-    check_steps(steps)
-    xp = namespace(ratios)
-    end = xp.asarray(ratios)
+    checks.count("steps", steps, 2)
+    end = checks.numbers("ratios", ratios, checks.POSITIVE)
+    if end.ndim != 1:
+        raise ValueError(f"ratios: expected shape (m,), one for each tendon, got {end.shape}")
     end = end if end.dtype.kind == "f" else end.astype(jnp.result_type(float))
     way = np.linspace(0.0, 1.0, steps).astype(end.dtype)[:, None]
     # Weighted, not 1 + way * (end - 1), so that the last command is `ratios` to the last bit.
     return to_device((1 - way) + way * end)
-
-
-def check_steps(steps: int) -> None:
-    """Refuse what is not a number of commands."""
-    if not isinstance(steps, int | np.integer) or steps < 2:
-        raise ValueError(f"steps: expected a whole number of at least 2, got {steps!r}")
 
 
 def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
@@ -63,10 +59,11 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     Raises:
         ValueError: as `command` and `equilibrium` do, or if `steps` is not a whole number of at least 2.
     """
-    check_steps(steps)
+    check_asked(scene, solver)
+    checks.count("steps", steps, 2)
     check_held(scene)
     command(scene, ratios)  # checks the ratios
-    end = to_device(ratios, scene.mesh.nodes.dtype)
+    end = to_device(checks.real("ratios", ratios), scene.mesh.nodes.dtype)
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     if is_concrete(end, *jax.tree.leaves(scene)):
         return _ramp(open_scene, layout, end, steps, solver)

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, unlock
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
-from jaxbeam.newton import Newton, force_round_off, relative_residual, row_magnitudes, topology
+from jaxbeam.newton import Newton, check_asked, force_round_off, relative_residual, row_magnitudes, topology
 from jaxbeam.overlap import crossing
 from jaxbeam.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
 from jaxbeam.solution import Status, check
@@ -126,16 +127,19 @@ def trace_branch(
         ValueError: as `command` does, or if an argument is out of its range.
         EquilibriumError: if there is no equilibrium at the start.
     """
-    if direction not in (1, -1):
+    check_asked(scene, solver)
+    if isinstance(direction, bool) or direction not in (1, -1):
         raise ValueError(f"direction: expected 1 or -1, got {direction!r}")
-    if not step > 0 or not interval[0] < interval[1] or not interval[0] <= parameter <= interval[1]:
+    step, parameter = checks.setting("step", step, checks.POSITIVE), checks.setting("parameter", parameter)
+    low, high = checks.numbers("interval", interval, shapes=((2,),)).tolist()
+    if not low <= parameter <= high or not low < high:
         raise ValueError(
-            f"expected step > 0 and interval[0] <= parameter <= interval[1], got step {step!r}, interval {interval!r}, "
-            f"parameter {parameter!r}"
+            f"expected interval[0] <= parameter <= interval[1], got interval {interval!r}, parameter {parameter!r}"
         )
+    checks.count("max_points", max_points, 1)
     dtype = scene.mesh.nodes.dtype
-    end = jnp.asarray(ratios, dtype)
     command(scene, ratios)  # checks the ratios
+    end = jnp.asarray(ratios, dtype)
     layout = solver.linear.layout(topology(scene))
     begin = dataclasses.replace(solver, escape=False)
     at_start = command(scene, 1 + parameter * (end - 1))
@@ -165,7 +169,7 @@ def trace_branch(
             length = min(1.5 * length, step)
         if progress is not None:
             progress(len(points), float(new.s))
-        if not interval[0] <= float(new.s) <= interval[1]:
+        if not low <= float(new.s) <= high:
             ended = "left"
             break
     stack = lambda name: np.stack([np.asarray(getattr(p, name)) for p in points])

@@ -17,11 +17,12 @@ import numpy as np
 import optax
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
-from jaxbeam.newton import Newton, topology
+from jaxbeam.newton import Newton, check_asked, topology
 from jaxbeam.scene import Scene, tendon_count
 from jaxbeam.search import History, Measure, Problem, Stand, search
 from jaxbeam.solution import Solution
@@ -99,11 +100,12 @@ def reach(
     Raises:
         ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
     """
-    problem, begin = _problem(scene, bounds, starts, tolerance, solver)
+    problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    if np.shape(target) != shape:
-        raise ValueError(f"target: expected the shape {shape} of the measure, got {np.shape(target)}")
-    return _reach(problem, jnp.asarray(target, scene.mesh.nodes.dtype), begin, measure, max_solves, solver)
+    goal = checks.numbers("target", target)
+    if goal.shape != shape:
+        raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
+    return _reach(problem, jnp.asarray(goal, scene.mesh.nodes.dtype), begin, measure, int(max_solves), solver)
 
 
 def reach_each(
@@ -122,18 +124,26 @@ def reach_each(
     So a tip draws a path, in one `lax.scan`: neighbouring targets take few solves each. The first is found as by
     `reach`. Arguments, errors and answer are those of `reach`, with leading axis `T`.
     """
-    problem, begin = _problem(scene, bounds, starts, tolerance, solver)
+    problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    if np.ndim(targets) != len(shape) + 1 or np.shape(targets)[1:] != shape or not np.shape(targets)[0]:
+    goals = checks.numbers("targets", targets)
+    if goals.ndim != len(shape) + 1 or goals.shape[1:] != shape or not goals.shape[0]:
         rows = f"(T, {shape[0]})" if shape else "(T,)"
-        raise ValueError(f"targets: expected shape {rows}, a row for each target, got {np.shape(targets)}")
-    return _reach_each(problem, jnp.asarray(targets, scene.mesh.nodes.dtype), begin, measure, max_solves, solver)
+        raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
+    return _reach_each(problem, jnp.asarray(goals, scene.mesh.nodes.dtype), begin, measure, int(max_solves), solver)
 
 
 def _problem(
-    scene: Scene, bounds: tuple[Numbers, Numbers], starts: Numbers | None, tolerance: float | None, solver: Newton
+    scene: Scene,
+    bounds: tuple[Numbers, Numbers],
+    starts: Numbers | None,
+    tolerance: float | None,
+    max_solves: int,
+    solver: Newton,
 ) -> tuple[Problem, jax.Array]:
     """The checked problem, and the commands `(S, m)` to start from."""
+    check_asked(scene, solver)
+    checks.count("max_solves", max_solves, 1)
     check_held(scene)
     dtype = scene.mesh.nodes.dtype
     count = tendon_count(scene)
@@ -141,17 +151,19 @@ def _problem(
         raise ValueError("scene: expected at least one tendon to command, got none")
     if tolerance is None:
         tolerance = 1e-8 if jnp.finfo(dtype).eps < 1e-10 else 1e-3
-    if not tolerance > 0:
-        raise ValueError(f"tolerance: expected a positive number, got {tolerance!r}")
+    tolerance = checks.number("tolerance", tolerance, checks.POSITIVE)
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError(f"bounds: expected the lowest and the highest ratio, (low, high), got {bounds!r}")
     ends = []
     for name, bound in zip(("low", "high"), bounds, strict=True):
-        if np.shape(bound) not in ((), (count,)):
-            raise ValueError(f"bounds: expected {name} of shape () or ({count},), got {np.shape(bound)}")
-        ends.append(jnp.broadcast_to(jnp.asarray(bound, dtype), (count,)))
+        end = checks.numbers(f"bounds, {name}", bound)
+        if end.shape not in ((), (count,)):
+            raise ValueError(f"bounds: expected {name} of shape () or ({count},), got {end.shape}")
+        ends.append(jnp.broadcast_to(jnp.asarray(end, dtype), (count,)))
     low, high = ends
     if is_concrete(low, high) and not ((np.asarray(low) > 0) & (np.asarray(low) <= np.asarray(high))).all():
         raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
-    begin = jnp.ones((1, count), dtype) if starts is None else jnp.asarray(starts, dtype)
+    begin = jnp.asarray(np.ones((1, count)) if starts is None else checks.numbers("starts", starts), dtype)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
     problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
@@ -160,6 +172,7 @@ def _problem(
 
 def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
     """The shape of a measure's value, checked."""
+    checks.function("measure", measure, "(scene, x) to shape () or (p,)")
     shape = jax.eval_shape(measure, scene, scene.mesh.nodes).shape
     if len(shape) > 1:
         raise ValueError(f"measure: expected a function (scene, x) to shape () or (p,), got shape {shape}")
@@ -273,15 +286,22 @@ def minimise(
     Raises:
         ValueError: if `steps` is not a whole number of at least 0, `theta0` holds no floats, or as `design` does.
     """
-    if not isinstance(steps, int | np.integer) or steps < 0:
-        raise ValueError(f"steps: expected a whole number of at least 0, got {steps!r}")
+    for name, value, form in (("loss", loss, "(scene, x) -> scalar"), ("design", design, "(theta) -> scene")):
+        checks.function(name, value, form)
+    if not hasattr(optimiser, "update"):
+        raise ValueError(f"optimiser: expected one of optax, such as optax.adam(1e-2), got {optimiser!r}")
+    checks.count("steps", steps, 0)
+    tolerance = checks.setting("tolerance", tolerance, checks.NOT_NEGATIVE)
+    goal = None if goal is None else checks.setting("goal", goal)
     # A weak dtype turns strong in the first update, and all would be compiled again.
     strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype))
     theta = strong(theta0)
     leaves = jax.tree.leaves(theta)
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise ValueError(f"theta0: expected a pytree of float arrays, got {theta0!r}")
-    check_held(design(theta))
+    first = design(theta)
+    check_asked(first, solver)
+    check_held(first)
 
     def objective(theta: Any, x: jax.Array) -> tuple[jax.Array, Solution]:
         scene = design(theta)
@@ -304,7 +324,7 @@ def minimise(
         return optax.apply_updates(theta, updates), state
 
     halfway = jax.jit(lambda a, b: jax.tree.map(lambda x, y: 0.5 * (x + y), a, b))
-    state, x = strong(transform.init(theta)), design(theta).mesh.nodes
+    state, x = strong(transform.init(theta)), first.mesh.nodes
     tried: list[tuple[Any, float, int]] = []
     best: tuple[Any, Solution, float] | None = None
     last, first_slope, solves, skips, status = theta, 0.0, 0, 0, DesignStatus.NOT_CONVERGED

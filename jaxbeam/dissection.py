@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import pytree, static_field, to_device
 from jaxbeam.chain import Topology, chain_of, multiplications
 from jaxbeam.linear import BlockTridiagonal
@@ -87,6 +88,10 @@ class NestedDissection:
 
     leaf: int = 48
     join: bool = True
+
+    def __post_init__(self) -> None:
+        checks.count("leaf", self.leaf, 1)
+        checks.flag("join", self.join)
 
     def layout(self, topology: Topology) -> DissectionLayout:
         return _layout(topology, self.leaf, self.join)

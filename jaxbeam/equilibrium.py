@@ -22,14 +22,16 @@ from jaxbeam.follow import follow
 from jaxbeam.held import check_held
 from jaxbeam.implicit import follow_scene
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
-from jaxbeam.newton import Newton, topology
+from jaxbeam.newton import Newton, check_asked, check_linear, topology
 from jaxbeam.predictor import begin
 from jaxbeam.scene import (
     Scene,
+    check_scene,
     command,
     energy,
     evaluate,
     partway,
+    placed,
     ratios_of,
     smallest_jacobian,
     stencil_hessians,
@@ -60,6 +62,7 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
         ValueError: if `x0` has another shape, or is concrete and not finite or inverts an element, or if a
             piece of the mesh is not held and moves as a rigid body.
     """
+    check_asked(scene, solver)
     check_held(scene)
     layout = solver.linear.layout(topology(scene))
     open_scene, x = unlock(scene), start(scene, x0)
@@ -78,18 +81,28 @@ def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Arr
     hand calculation (`euler_bernoulli`) is right to 0.3 %.
 
     Raises:
-        ValueError: if a piece of the mesh is not held.
+        ValueError: if a piece of the mesh is not held, or the scene is not stable at rest: then a small command or load
+            does not lead to a state near rest. Inside jit free coordinates are NaN then.
     """
+    check_scene(scene)
+    check_linear("linear", linear)
     check_held(scene)
-    return _linear_response(unlock(scene), linear.layout(topology(scene)), linear)
+    x, stable = _linear_response(unlock(scene), linear.layout(topology(scene)), linear)
+    if is_concrete(stable) and not stable:
+        raise ValueError(
+            "scene: it is not stable at rest, its stiffness there is not positive definite, so no linear response "
+            "exists; see lowest_mode(scene, scene.mesh.nodes), and solve it with equilibrium"
+        )
+    return x
 
 
 @compiled("linear")
-def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> jax.Array:
+def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array]:
+    """The positions, and whether the stiffness at rest is positive definite: if not, its factor makes them NaN."""
     rest = scene.mesh.nodes
-    factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
+    factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
     step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
-    return rest - expand(layout, step, rest.shape)
+    return rest - expand(layout, step, rest.shape), stable
 
 
 @compiled("solver")
@@ -145,9 +158,8 @@ def start(scene: Scene, x0: Numbers | None) -> jax.Array:
     rest = scene.mesh.nodes
     if x0 is None:
         return rest
-    if np.shape(x0) != rest.shape:
-        raise ValueError(f"x0: expected node positions of shape {rest.shape}, got {np.shape(x0)}")
-    x = jnp.where(scene.fixed, rest, jnp.asarray(x0, rest.dtype))
+    x0 = placed(scene, x0, "x0")
+    x = jnp.where(scene.fixed, rest, x0.astype(rest.dtype))
     if is_concrete(x0, rest):
         finite = np.isfinite(np.asarray(x0)).all(axis=1)
         if not finite.all():

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import pytree, static_field, to_device
 from jaxbeam.chain import Topology, chain_of, coupled
 
@@ -170,6 +171,9 @@ class BlockTridiagonal:
     """
 
     joined: int = 32
+
+    def __post_init__(self) -> None:
+        checks.count("joined", self.joined, 0)
 
     def layout(self, topology: Topology) -> Layout:
         return _bordered_layout(topology, self.joined)

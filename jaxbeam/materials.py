@@ -8,11 +8,19 @@ their digits: `|F|^2 - 2 = 2 tr H + |H|^2`, `J - 1 = tr H + det H`. All are diff
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam._tree import Numbers, is_concrete, namespace, pytree, to_device
+from jaxbeam.checks import POSITIVE, Range, function, numbers, scalar
+
+# Poisson's ratio of a stable material.
+POISSON = Range("a value in (-1, 0.5)", "a value in (-1, 0.5)", low=-1, high=0.5)
 
 
 @pytree
@@ -34,12 +42,15 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
         `mu = E / (2 (1 + nu))`, `lam = E nu / ((1 + nu)(1 - 2 nu))`, differentiable in both.
 
     Raises:
-        ValueError: if concrete values are outside their range.
+        ValueError: if concrete values are outside their range, or both are arrays of different shapes. A traced value
+            outside its range becomes NaN.
     """
-    _check_range("young", young, 0.0, np.inf, "a stiffness is positive")
-    _check_range("poisson", poisson, -1.0, 0.5, "0.5 is incompressible, where lam is infinite: use 0.4999, say")
-    xp, dtype = namespace(young, poisson), jnp.result_type(float)
-    E, nu = xp.asarray(young, dtype), xp.asarray(poisson, dtype)
+    E = numbers("young", young, POSITIVE, why="a stiffness is positive")
+    nu = numbers("poisson", poisson, POISSON, why="0.5 is incompressible, where lam is infinite: use 0.4999, say")
+    if () not in (E.shape, nu.shape) and E.shape != nu.shape:
+        raise ValueError(f"poisson: expected a scalar or the shape of young, {E.shape}, got {nu.shape}")
+    xp, dtype = namespace(E, nu), jnp.result_type(float)
+    E, nu = xp.asarray(E, dtype), xp.asarray(nu, dtype)
     return Lame(to_device(E / (2 * (1 + nu))), to_device(E * nu / ((1 + nu) * (1 - 2 * nu))))
 
 
@@ -120,14 +131,70 @@ def linear_elastic(H: jax.Array, params: Lame) -> jax.Array:
     return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
 
 
-def _check_range(name: str, value: Numbers, low: float, high: float, why: str) -> None:
-    if not is_concrete(value):
+# --------------------------------------------------------------------------------- a density of one's own
+
+
+_OWN = (macklin_mueller, neo_hookean, saint_venant_kirchhoff, linear_elastic)
+
+
+def check_density(density: Callable[[jax.Array, Any], jax.Array], material: Any) -> None:
+    """Refuse a density that returns no scalar, or that takes its argument for `F` where it gets `H = F - I`.
+
+    It is asked for a few energies, of the first element, once for each density and parameters. Traced parameters are
+    taken to be 1.
+
+    Args:
+        density: of a solid or a rod.
+        material: its parameters, with an entry for each element.
+
+    Raises:
+        ValueError: if its value is not a scalar, is not finite at rest, `H = 0`, or is that of a density in `F`.
+    """
+    function("density", density, "(H, params) -> scalar")
+    if density in _OWN:
+        if not all(hasattr(getattr(material, name, None), "shape") for name in ("mu", "lam")):
+            raise ValueError(
+                f"params: expected the mu and lam of {density.__name__}, such as lame(young, poisson), got {material!r}"
+            )
         return
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: expected a real number or array, got {value!r}")
-    bad = np.flatnonzero(~((array > low) & (array < high)))
-    if bad.size:
-        where = f" at element {bad[0]}" if array.ndim else ""
-        got = f"{array.ravel()[bad[0]]:g}"
-        raise ValueError(f"{name}: expected a value in ({low:g}, {high:g}), got {got}{where}; {why}")
+    leaves, structure = jax.tree.flatten(material)
+    first = tuple(np.asarray(leaf)[0] if is_concrete(leaf) else np.ones(leaf.shape[1:], leaf.dtype) for leaf in leaves)
+    known = tuple((leaf.dtype.str, leaf.shape, np.asarray(leaf).tobytes()) for leaf in first)
+    _check_own(density, structure, known)
+
+
+@lru_cache(maxsize=64)
+def _check_own(density: Callable[[jax.Array, Any], jax.Array], structure: Any, known: tuple[Any, ...]) -> None:
+    """`check_density` of one element's parameters, given by dtype, shape and bytes."""
+    leaves = [np.frombuffer(data, dtype).reshape(shape) for dtype, shape, data in known]
+    material = jax.tree.unflatten(structure, leaves)
+    dtype = leaves[0].dtype if leaves else jnp.result_type(float)
+    scalar("density", "(H, params)", density, jax.ShapeDtypeStruct((2, 2), dtype), material)
+    one, turn, strained = np.eye(2), _turned(1.0), np.array([[1.3, 0.2], [-0.1, 0.9]])
+    states = np.stack([0 * one, turn - one, one, strained, turn @ strained]).astype(dtype)
+    try:
+        with jax.ensure_compile_time_eval():
+            found = _energies(density, states, material)
+    except FloatingPointError:
+        # So `jax_debug_nans` says that a value is not a number.
+        found = np.full(len(states), np.nan)
+    if not is_concrete(found):
+        return
+    rest, turned, unit, before, after = np.asarray(found).tolist()
+    # A density in F does not see a rotation of F, and one in H none of H + I.
+    same = lambda a, b: abs(a - b) <= 1e3 * float(jnp.finfo(dtype).eps) * (abs(a) + abs(b) + abs(rest - unit))
+    in_f = same(before, after) and not same(rest, turned) and unit < rest
+    if in_f or not np.isfinite(rest):
+        raise ValueError(
+            f"density: expected the energy of H = F - I, the displacement gradient, 0 at rest; got one that is "
+            f"{rest:g} at H = 0 and {unit:g} at H = I, so it seems to be written in F; begin it with F = H + jnp.eye(2)"
+        )
+
+
+@partial(jax.jit, static_argnums=0)
+def _energies(density: Callable[[jax.Array, Any], jax.Array], states: jax.Array, material: Any) -> jax.Array:
+    return jax.vmap(lambda H: density(H, material))(states)
+
+
+def _turned(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

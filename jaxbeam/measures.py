@@ -1,6 +1,7 @@
 """What is measured on a beam: angles, positions, lengths, tensions, stresses, energies.
 
-Each takes the scene and node positions `x` `(n, 2)`, of a rod `(n, 3)`, is pure, and is differentiable in both.
+Each takes the scene and node positions `x` `(n, 2)`, of a rod `(n, 3)`, is pure, and is differentiable in both. An `x`
+of another shape is refused: for many states use `jax.vmap`.
 Angles are in degrees, everything else in the user's units.
 """
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from jaxbeam.elements import EDGES, degree_of, rule
 from jaxbeam.rod import Line, RodEnergy
-from jaxbeam.scene import Scene, solid_terms, tendon_terms
+from jaxbeam.scene import Scene, placed, solid_terms, tendon_terms
 from jaxbeam.scene import smallest_jacobian as smallest_jacobian
 from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, Term, displacement_gradients
 
@@ -28,8 +29,13 @@ def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
     `atan2(mean over the right edge of (y - y_rest), length)`.
 
     Raises:
-        ValueError: if the scene has no tip or no clamped node.
+        ValueError: if `x` has another shape, the scene has no tip or no clamped node, or its whole tip is clamped.
     """
+    x = placed(scene, x)
+    if scene.fixed[_tip(scene)][:, :2].all():
+        raise ValueError(
+            "scene: its tip is clamped, so the tip angle is always 0; give Scene(..., tip=nodes) that move"
+        )
     along, length = _axis(scene)
     moved = tip_position(scene, x) - tip_position(scene, scene.mesh.nodes)
     return jnp.rad2deg(jnp.arctan2(along[0] * moved[1] - along[1] * moved[0], length))
@@ -39,9 +45,9 @@ def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     """Mean position `(2,)` of the tip nodes.
 
     Raises:
-        ValueError: if the scene has no tip.
+        ValueError: if `x` has another shape, or the scene has no tip.
     """
-    return jnp.mean(x[_tip(scene)][:, :2], axis=0)
+    return jnp.mean(placed(scene, x)[_tip(scene)][:, :2], axis=0)
 
 
 def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
@@ -51,8 +57,9 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     mean turn of the tip's nodes, which may be more than one round.
 
     Raises:
-        ValueError: if the scene has no tip, or a solid fewer than two tip nodes.
+        ValueError: if `x` has another shape, the scene has no tip, or a solid fewer than two tip nodes.
     """
+    x = placed(scene, x)
     tip = _tip(scene)
     if isinstance(scene.mesh, Line):
         return jnp.rad2deg(jnp.mean((x - scene.mesh.nodes)[tip, 2]) / scene.mesh.radian)
@@ -95,6 +102,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
         ValueError: if the scene has no solid, or a solid has quadrature points of a rule that is not in
             `jaxbeam.elements`.
     """
+    x = placed(scene, x)
     total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
     for term, stress in _at_points(scene, x, _stress):
         recover = jnp.asarray(_points_to_nodes(term.nodes.shape[1], stress.shape[1]), x.dtype)
@@ -106,6 +114,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
 
 def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
+    x = placed(scene, x)
     bodies = [t for t in scene.terms if isinstance(t.energy, SolidEnergy | RodEnergy)]
     found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in bodies]
     return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
@@ -123,7 +132,7 @@ def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> j
 
 def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
     """For each solid, `measure(H, density, material)` at the quadrature points of its elements, `(m, q, ...)`."""
-    found = []
+    x, found = placed(scene, x), []
     for term in solid_terms(scene):
         assert isinstance(term.energy, SolidEnergy)
         density = term.energy.density
@@ -156,7 +165,7 @@ def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
 
 def _over_tendons(scene: Scene, x: jax.Array, measure: Callable[[TendonEnergy], Callable[..., jax.Array]]) -> jax.Array:
     """A measure of each tendon, `(m,)`."""
-    found = []
+    x, found = placed(scene, x), []
     for term in tendon_terms(scene):
         assert isinstance(term.energy, TendonEnergy)
         found.append(jax.vmap(measure(term.energy))(x[term.nodes], term.params))

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, to_device
+from jaxbeam import checks
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, to_device
 from jaxbeam.elements import EDGES, shape_functions, shape_slopes
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
@@ -31,27 +32,28 @@ class Mesh:
 
     Raises:
         ValueError: if a shape or dtype is wrong, an index is out of range, a triangle repeats a node, is
-            listed twice, is inverted somewhere or has no area, a node is unused, two nodes coincide, or a
-            coordinate is not finite. Checks on positions are skipped while `nodes` is traced.
+            listed twice, is inverted somewhere or has no area, a node is unused, two nodes coincide, a
+            coordinate is not finite, or two triangles overlap. Where edges are curved, overlaps are found only
+            between triangles that share an edge. While `nodes` is traced, a node that is not finite and a triangle that
+            is inverted or has no area make it NaN, and whatever is solved on it `INVALID`; nodes that coincide and
+            triangles that overlap without sharing an edge are not looked for.
     """
 
     nodes: jax.Array
     elements: np.ndarray = index_field()
 
     def __post_init__(self) -> None:
-        elements = _checked_elements(self.elements)
-        nodes = self.nodes
-        if not isinstance(nodes, jax.Array):
-            nodes = np.asarray(nodes)
-            if nodes.dtype.kind not in "fiu":
-                raise ValueError(f"nodes: expected real numbers, got dtype {nodes.dtype}; convert with .astype(float)")
-            if nodes.dtype.kind != "f":
-                nodes = nodes.astype(float)
-        if nodes.ndim != 2 or nodes.shape[1] != 2:
-            raise ValueError(f"nodes: expected shape (n, 2), got {nodes.shape}; give one (x, y) row for each node")
+        elements = checks.whole_numbers("elements", self.elements, "(t, 3) or (t, 6)", (3, 6))
+        nodes = float_nodes(self.nodes, 2, "(x, y)")
         _check_topology(nodes.shape[0], elements)
         if is_concrete(nodes):
-            _check_geometry(np.asarray(nodes, dtype=np.float64), elements)
+            positions = np.asarray(nodes, dtype=np.float64)
+            _check_geometry(positions, elements)
+            _check_overlaps(positions, elements, _surface_of(elements))
+        else:
+            _surface_of(elements)
+            upright = _areas(nodes, elements) > SLIVER * jnp.max(jnp.ptp(nodes, axis=0)) ** 2
+            nodes = checks.poisoned(nodes, jnp.all(upright))
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
 
@@ -94,13 +96,15 @@ def rectangle(
             `diagonals` or `order` is unknown, a mirrored mesh is asked for with an even `ny`, or a graded one with an
             `nx` of 2.
     """
-    if order not in (1, 2):
+    if not isinstance(order, int | np.integer) or isinstance(order, bool) or order not in (1, 2):
         raise ValueError(f"order: expected 1 (triangles of three nodes) or 2 (of six), got {order!r}")
-    check_count("nx", nx)
-    check_count("ny", ny)
-    check_length("length", length)
-    check_length("height", height)
-    if diagonals not in ("one-sided", "mirrored", "crossed"):
+    checks.count("nx", nx, 2)
+    checks.count("ny", ny, 2)
+    length, height = (
+        checks.number(name, value, checks.POSITIVE) for name, value in (("length", length), ("height", height))
+    )
+    graded, dtype = checks.flag("graded", graded), checks.float_dtype("dtype", dtype)
+    if not isinstance(diagonals, str) or diagonals not in ("one-sided", "mirrored", "crossed"):
         raise ValueError(f"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got {diagonals!r}")
     if diagonals == "mirrored" and ny % 2 == 0:
         raise ValueError(
@@ -131,8 +135,6 @@ def rectangle(
             (np.where(falling, lower_right, lower_left), upper_right, upper_left),
         ]
     elements = np.stack([np.stack(t, axis=1) for t in triangles], axis=1).reshape(-1, 3)
-    if dtype is None:
-        dtype = jnp.result_type(float)
     xp = namespace(length, height)
     extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
     mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
@@ -157,26 +159,15 @@ def middle_column(nx: int, graded: bool) -> int:
     return (nx - 1) // 2
 
 
-def check_length(name: str, value: Numbers) -> None:
-    """Refuse a concrete value that is not one positive finite number."""
-    if is_concrete(value) and not (np.ndim(value) == 0 and np.isfinite(value) and np.asarray(value) > 0):
-        raise ValueError(f"{name}: expected a positive finite number, got {value!r}")
-
-
-def check_count(name: str, count: int) -> None:
-    """Refuse what is not a whole number of at least 2."""
-    if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 2:
-        raise ValueError(f"{name}: expected a whole number of at least 2, got {count!r}")
-
-
 def quadratic(mesh: Mesh) -> Mesh:
     """The mesh of the same triangles with six nodes each: those between corners follow after the corners.
 
     Differentiable in the nodes.
 
     Raises:
-        ValueError: if the triangles have six nodes already.
+        ValueError: if the triangles have six nodes already, or it is not made of triangles.
     """
+    check_triangles(mesh)
     if mesh.elements.shape[1] != 3:
         raise ValueError("mesh: its triangles have six nodes already")
     return _made(mesh, with_middle_nodes(mesh.elements, len(mesh.nodes)))
@@ -186,7 +177,11 @@ def refined(mesh: Mesh) -> Mesh:
     """The mesh with every triangle cut into four by the middles of its edges, four in the place of one.
 
     Nodes keep their numbers. Six-node triangles keep the shape of their edges. Differentiable in the nodes.
+
+    Raises:
+        ValueError: if it is not made of triangles.
     """
+    check_triangles(mesh)
     return _made(mesh, cut_in_four(mesh.elements, len(mesh.nodes)))
 
 
@@ -234,6 +229,8 @@ def cut_in_four(elements: np.ndarray, count: int) -> Finer:
     return Finer(whole.reshape(-1, 6), nodes, np.concatenate([own, values[first % 12]]))
 
 
+# A triangle of no more area than this share of the square of the body's extent has none.
+SLIVER = 1e-14
 # The places of the six nodes of a triangle, and those of the corners and middles of its four parts that are among them.
 _PLACES = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
 _PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
@@ -268,6 +265,7 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
     >>> [int(i) for i in left]
     [0, 1]
     """
+    checks.function("predicate", predicate, "(x, y) -> booleans")
     x, y = _concrete_nodes(mesh).T
     mask = np.asarray(predicate(x, y))
     if mask.shape != x.shape or mask.dtype != bool:
@@ -285,9 +283,9 @@ def nearest_node(mesh: Mesh, point: Numbers) -> int:
     Raises:
         ValueError: if the point is not two finite numbers, or the nodes are traced.
     """
-    target = np.asarray(point, dtype=float)
-    if target.shape != (2,) or not np.isfinite(target).all():
-        raise ValueError(f"point: expected two finite coordinates, got {point!r}")
+    if not is_concrete(point):
+        raise ValueError("point: expected two known coordinates, got traced ones; select nodes outside jit and grad")
+    target = checks.numbers("point", point, shapes=((2,),))
     return int(np.argmin(np.sum((_concrete_nodes(mesh) - target) ** 2, axis=1)))
 
 
@@ -305,6 +303,7 @@ def pieces(elements: np.ndarray, count: int) -> np.ndarray:
 
 
 def _concrete_nodes(mesh: Mesh) -> np.ndarray:
+    checks.instance("mesh", mesh, Mesh, "a scene has it as scene.mesh")
     if not is_concrete(mesh.nodes):
         raise ValueError(
             "mesh: its nodes are traced, so nodes cannot be selected by position; select before jit or grad"
@@ -312,19 +311,23 @@ def _concrete_nodes(mesh: Mesh) -> np.ndarray:
     return np.asarray(mesh.nodes, dtype=np.float64)
 
 
-def _checked_elements(elements: Any) -> np.ndarray:
-    if not is_concrete(elements):
-        raise ValueError("elements: expected concrete node numbers, got a traced array; build the topology outside")
-    array = np.asarray(elements)
-    if array.dtype.kind not in "iu":
-        raise ValueError(f"elements: expected whole numbers, got dtype {array.dtype}")
-    if array.ndim != 2 or array.shape[1] not in (3, 6) or array.shape[0] == 0:
-        raise ValueError(
-            f"elements: expected shape (t, 3) or (t, 6) with t >= 1, got {array.shape}; give a row for each triangle"
-        )
-    if array.max() >= 2**31:
-        raise ValueError(f"elements: node numbers must fit 32 bits, got {array.max()}")
-    return read_only(array, np.int32)
+def check_triangles(mesh: Mesh) -> None:
+    """Refuse what is not a mesh of triangles."""
+    checks.instance("mesh", mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)")
+    if mesh.elements.shape[1] == 2:
+        raise ValueError("mesh: expected triangles, got the Line of a rod, whose body is rod(line, height, params)")
+
+
+def float_nodes(value: Any, columns: int, row: str) -> Any:
+    """Rest positions `(n, columns)` as floats, each `row` of them; JAX arrays as they are."""
+    array = checks.real("nodes", value)
+    if array.dtype.kind != "f":
+        if isinstance(value, jax.Array):
+            raise ValueError(f"nodes: expected floats, got dtype {array.dtype}; convert them with .astype(float)")
+        array = array.astype(float)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise ValueError(f"nodes: expected shape (n, {columns}), got {array.shape}; give one {row} row for each node")
+    return value if isinstance(value, jax.Array) else array
 
 
 def _check_topology(count: int, elements: np.ndarray) -> None:
@@ -337,10 +340,6 @@ def _check_topology(count: int, elements: np.ndarray) -> None:
     if repeated.size:
         k = repeated[0]
         raise ValueError(f"elements: triangle {k} repeats a node: {elements[k].tolist()}; remove it")
-    _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
-    if (counts > 1).any():
-        k = int(first[counts > 1].min())
-        raise ValueError(f"elements: triangle {k}, {elements[k].tolist()}, is listed more than once; remove the copies")
     used = np.zeros(count, bool)
     used[elements] = True
     if not used.all():
@@ -365,14 +364,8 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         raise ValueError(
             f"nodes: nodes {original[k]} and {k} coincide at {nodes[k].tolist()}; merge them, or the body is torn there"
         )
-    a, b, c = nodes[elements[:, 0]], nodes[elements[:, 1]], nodes[elements[:, 2]]
-    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    if elements.shape[1] == 6 and (area > 0).all():
-        # Where edges are curved the triangle must not fold over at any of its nodes.
-        slopes = shape_slopes(6, _PLACES)
-        map_ = np.einsum("tkd,qki->tqdi", nodes[elements], slopes)
-        area = 0.5 * np.linalg.det(map_).min(axis=1)
-    bad = np.flatnonzero(area <= 1e-14 * extent**2)
+    area = _areas(nodes, elements)
+    bad = np.flatnonzero(area <= SLIVER * extent**2)
     if bad.size:
         k = bad[0]
         cure = "list its corners counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
@@ -380,3 +373,125 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
             f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
             f" ({bad.size} such triangles)"
         )
+
+
+def _areas(nodes: Any, elements: np.ndarray) -> Any:
+    """Signed area `(t,)` of each triangle; of one with curved edges, the least that it has at any of its nodes."""
+    xp = namespace(nodes)
+    a, b, c = (nodes[elements[:, k]] for k in range(3))
+    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    if elements.shape[1] == 3:
+        return area
+    slopes = shape_slopes(6, _PLACES).astype(nodes.dtype)
+    map_ = xp.einsum("tkd,qki->tqdi", nodes[elements], slopes)
+    determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
+    return xp.minimum(area, 0.5 * xp.min(determinant, axis=1))
+
+
+# ----------------------------------------------------------------------------------------------- overlaps
+
+
+def _surface_of(elements: np.ndarray) -> np.ndarray:
+    """Edges `(b, 2)` of the surface, the body on their left, after a check of all edges.
+
+    Raises:
+        ValueError: if two triangles lie on the same side of an edge: if each is counter-clockwise, an edge runs one way
+            in one of its triangles and the other way in the other.
+    """
+    a, b = elements[:, EDGES].reshape(-1, 2).T.astype(np.int64)
+    total = int(elements.max()) + 1
+    # One number tells both ends of a side and its direction; those of one edge are neighbours when sorted.
+    sides = np.sort((np.minimum(a, b) * total + np.maximum(a, b)) * 2 + (a > b))
+    edge = sides >> 1
+    twice = np.flatnonzero(sides[1:] == sides[:-1])
+    if twice.size:
+        ends = divmod(int(edge[twice[0]]), total)
+        those = np.flatnonzero(np.isin(elements[:, :3], ends).sum(axis=1) == 2)
+        corners = np.sort(elements[those, :3], axis=1)
+        if len(np.unique(corners, axis=0)) < len(those):
+            k = those[0]
+            raise ValueError(
+                f"elements: triangle {k}, {elements[k].tolist()}, is listed more than once; remove the copies"
+            )
+        raise ValueError(
+            f"elements: triangles {those.tolist()} meet in the edge between nodes {ends[0]} and {ends[1]}, and two of "
+            f"them lie on the same side of it; triangles must not overlap"
+        )
+    shared = np.append(edge[1:] == edge[:-1], False)
+    alone = ~(shared | np.roll(shared, 1))
+    low, high = np.divmod(edge[alone], total)
+    turned = (sides[alone] & 1).astype(bool)
+    return np.stack([np.where(turned, high, low), np.where(turned, low, high)], axis=1)
+
+
+def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) -> None:
+    """Refuse triangles that overlap, from the surface `edges` alone, of triangles that are counter-clockwise.
+
+    So many triangles lie over a point as the surface winds round it. That number changes only across the surface: it is
+    at most 1 if no two edges of the surface cross, and it is 1 beside each of them.
+    """
+    # Measured from one of its nodes, wherever the body lies.
+    begin, end = (nodes[edges[:, k]] - nodes[edges[0, 0]] for k in (0, 1))
+    extent = np.ptp(begin, axis=0)
+    if elements.shape[1] == 6:
+        bulge = nodes[elements[:, 3:]] - nodes[elements[:, EDGES]].mean(axis=2)
+        if np.abs(bulge).max() > 1e-9 * extent.max():
+            return
+    first, second = _crossing(begin, end, int(np.argmax(extent)))
+    if first.size:
+        here, there = edges[first[0]].tolist(), edges[second[0]].tolist()
+        raise ValueError(
+            f"elements: triangles overlap: the edge between nodes {here[0]} and {here[1]} of the surface crosses that "
+            f"between nodes {there[0]} and {there[1]}"
+        )
+    covered = np.flatnonzero(_windings(begin, end) > 1)
+    if covered.size:
+        a, b = edges[covered[0]].tolist()
+        raise ValueError(f"elements: triangles overlap: others lie over that at the edge between nodes {a} and {b}")
+
+
+def _crossing(begin: np.ndarray, end: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of edges, as numbers of the first and of the second, that cross each other between their ends."""
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    order = np.argsort(low[:, axis])
+    last = np.searchsorted(low[order, axis], high[order, axis])
+    i, j = (order[k] for k in _ranges(np.arange(1, len(order) + 1), last))
+    near = (low[i, 1 - axis] < high[j, 1 - axis]) & (low[j, 1 - axis] < high[i, 1 - axis])
+    i, j = i[near], j[near]
+    # What is no more than round-off counts as touching.
+    noise = 1e-12 * np.abs(end).max()
+
+    def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        along = end[one] - begin[one]
+        least = noise * np.linalg.norm(along, axis=1)
+        sides = [_cross(along, point[other] - begin[one]) for point in (begin, end)]
+        return (np.minimum(*sides) < -least) & (np.maximum(*sides) > least)
+
+    crossed = apart(i, j) & apart(j, i)
+    return i[crossed], j[crossed]
+
+
+def _windings(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """How often the edges wind round the point just left of the middle of each."""
+    along = end - begin
+    point = (begin + end) / 2 + 1e-6 * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    order = np.argsort(point[:, 1])
+    heights = point[order, 1]
+    first, last = (np.searchsorted(heights, of(begin[:, 1], end[:, 1])) for of in (np.minimum, np.maximum))
+    edge, k = _ranges(first, last)
+    beside = order[k]
+    side = np.sign(_cross(along[edge], point[beside] - begin[edge]))
+    # A ray to the right of the point meets the edges on that side: upward ones, or downward ones.
+    up = np.sign(along[edge, 1])
+    return np.bincount(beside, up * (side == up), minlength=len(begin))
+
+
+def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs `(i, k)` with `first[i] <= k < last[i]`."""
+    lengths = np.maximum(last - first, 0)
+    i = np.repeat(np.arange(len(first)), lengths)
+    return i, np.arange(len(i)) + np.repeat(first - np.cumsum(lengths) + lengths, lengths)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

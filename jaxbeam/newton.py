@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import blank, choose, key_of, once
 from jaxbeam.chain import Topology
 from jaxbeam.dissection import Automatic
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
-from jaxbeam.scene import Evaluation, Scene, evaluate, extent, largest_step, stencil_hessians
+from jaxbeam.scene import Evaluation, Scene, check_scene, evaluate, extent, largest_step, stencil_hessians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,18 +48,30 @@ class Newton:
     escape: bool = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.max_steps, int | np.integer) or self.max_steps < 0:
-            raise ValueError(f"max_steps: expected a whole number of at least 0, got {self.max_steps!r}")
-        if self.rtol is not None and not 0 < self.rtol < 1:
-            raise ValueError(f"rtol: expected a number between 0 and 1, got {self.rtol!r}")
-        if not 0 < self.keep_volume < 1:
-            raise ValueError(f"keep_volume: expected a number between 0 and 1, got {self.keep_volume!r}")
+        checks.count("max_steps", self.max_steps, 0)
+        if self.rtol is not None:
+            checks.setting("rtol", self.rtol, checks.SHARE)
+        checks.setting("keep_volume", self.keep_volume, checks.SHARE)
+        checks.flag("escape", self.escape)
+        check_linear("linear", self.linear)
 
     def tolerance(self, dtype: Any) -> float:
         """The relative residual to reach in this dtype."""
         if self.rtol is not None:
             return self.rtol
         return 1e-10 if jnp.finfo(dtype).eps < 1e-10 else 1e-6
+
+
+def check_linear(name: str, linear: Any) -> None:
+    """Refuse what is not a linear solver."""
+    if isinstance(linear, type) or not callable(getattr(linear, "factor_indefinite", None)):
+        raise ValueError(f"{name}: expected a linear solver, such as BlockTridiagonal() or Dense(), got {linear!r}")
+
+
+def check_asked(scene: Scene, solver: Newton) -> None:
+    """Refuse what is not a scene to solve, or not a solver."""
+    check_scene(scene)
+    checks.instance("solver", solver, Newton, "make one with Newton(...)")
 
 
 # Line search. Armijo's constant is the usual one; `APPROXIMATE` is delta of Hager and Zhang (2005).

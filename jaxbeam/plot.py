@@ -31,7 +31,7 @@ from jaxbeam._tree import Numbers
 from jaxbeam.branch import Branch
 from jaxbeam.measures import tendon_tensions, tip_angle
 from jaxbeam.outlines import arms, edge_curves, elements_of, extremes, outline, patches, rings, tendon_points
-from jaxbeam.scene import Scene, command, tendon_count
+from jaxbeam.scene import Scene, command, placed, tendon_count
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
@@ -452,9 +452,7 @@ def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def _positions(scene: Scene, x: Numbers) -> np.ndarray:
-    positions = np.asarray(x)
-    if positions.shape != scene.mesh.nodes.shape:
-        raise ValueError(f"x: expected node positions of shape {scene.mesh.nodes.shape}, got {positions.shape}")
+    positions = np.asarray(placed(scene, x))
     if not np.isfinite(positions).all():
         raise ValueError("x: some positions are not finite and cannot be drawn; see check(solution)")
     return positions

@@ -32,11 +32,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._rules import custom_derivative
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, replace, to_device
-from jaxbeam.materials import macklin_mueller
-from jaxbeam.mesh import Mesh, check_count, check_length
-from jaxbeam.terms import TendonEnergy, Term, inverse_square_stiffness, polyline_length, tendons
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
+from jaxbeam.materials import POISSON, check_density, macklin_mueller
+from jaxbeam.mesh import Mesh, float_nodes
+from jaxbeam.terms import (
+    TendonEnergy,
+    Term,
+    check_law,
+    inverse_square_stiffness,
+    polyline_length,
+    tendons,
+)
 
 # Reissner's shear coefficient of a rectangular section.
 SHEAR = 5 / 6
@@ -58,8 +66,8 @@ class Line(Mesh):
 
     Raises:
         ValueError: if a shape or dtype is wrong, an index is out of range, a node is unused, a coordinate is not
-            finite, `radian` is not positive, or an element has no length or does not run along its angle. Checks on
-            numbers are skipped while they are traced.
+            finite, `radian` is not positive, or an element has no length or does not run along its angle. Traced
+            numbers of which that holds become NaN, and whatever is solved on them is `INVALID`.
     """
 
     nodes: jax.Array
@@ -67,53 +75,52 @@ class Line(Mesh):
     radian: jax.Array
 
     def __post_init__(self) -> None:
-        nodes = self.nodes if isinstance(self.nodes, jax.Array) else np.asarray(self.nodes)
-        if nodes.dtype.kind != "f" or nodes.ndim != 2 or nodes.shape[1] != 3:
-            raise ValueError(
-                f"nodes: expected floats of shape (n, 3), a row (x, y, radian * angle) for each node, got shape "
-                f"{nodes.shape} of dtype {nodes.dtype}"
-            )
-        check_length("radian", self.radian)
+        nodes = float_nodes(self.nodes, 3, "(x, y, radian * angle)")
+        radian = to_device(checks.number("radian", self.radian, checks.POSITIVE), nodes.dtype)
         elements = _checked_pairs(self.elements, nodes.shape[0])
-        if is_concrete(nodes, self.radian):
-            _check_line(np.asarray(nodes, float), elements, float(np.asarray(self.radian)))
+        if is_concrete(nodes, radian):
+            _check_line(np.asarray(nodes, float), elements, float(radian))
+        else:
+            length, along, _ = _run(nodes, elements, radian)
+            nodes = checks.poisoned(jnp.asarray(nodes), jnp.all(along > ALIGNED * length))
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
-        object.__setattr__(self, "radian", to_device(self.radian, nodes.dtype))
+        object.__setattr__(self, "radian", radian)
 
 
-def _checked_pairs(elements: Any, count: int) -> np.ndarray:
-    array = np.asarray(elements if is_concrete(elements) else [0.0])
-    if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != 2 or not len(array):
-        raise ValueError(
-            f"elements: expected concrete whole numbers of shape (m, 2), two nodes for each element, got shape "
-            f"{np.shape(elements)}"
-        )
-    bad = np.flatnonzero(((array < 0) | (array >= count)).any(axis=1))
+def _checked_pairs(elements: Any, total: int) -> np.ndarray:
+    array = checks.whole_numbers("elements", elements, "(m, 2)", (2,))
+    bad = np.flatnonzero(((array < 0) | (array >= total)).any(axis=1))
     if bad.size:
         raise ValueError(
-            f"elements: element {bad[0]} is {array[bad[0]].tolist()}, but nodes are numbered 0 to {count - 1}"
+            f"elements: element {bad[0]} is {array[bad[0]].tolist()}, but nodes are numbered 0 to {total - 1}"
         )
-    unused = np.setdiff1d(np.arange(count), array)
+    unused = np.setdiff1d(np.arange(total), array)
     if unused.size:
         raise ValueError(
             f"nodes: {unused.size} belong to no element, the first is node {unused[0]}; remove them and renumber"
         )
-    return read_only(array, np.int32)
+    return array
+
+
+def _run(nodes: Any, elements: np.ndarray, radian: Any) -> tuple[Any, Any, Any]:
+    """Length of each element `(m,)`, how far it runs along its angle, and that angle."""
+    xp = namespace(nodes, radian)
+    first, second = (xp.asarray(nodes)[elements[:, k]] for k in (0, 1))
+    chord, angle = (second - first)[:, :2], (first + second)[:, 2] / (2 * radian)
+    return xp.sqrt(xp.sum(chord**2, axis=1)), chord[:, 0] * xp.cos(angle) + chord[:, 1] * xp.sin(angle), angle
 
 
 def _check_line(nodes: np.ndarray, elements: np.ndarray, radian: float) -> None:
     wild = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
     if wild.size:
         raise ValueError(f"nodes: node {wild[0]} is not finite: {nodes[wild[0]].tolist()}")
-    first, second = nodes[elements[:, 0]], nodes[elements[:, 1]]
-    chord, angle = (second - first)[:, :2], (first + second)[:, 2] / (2 * radian)
-    length = np.linalg.norm(chord, axis=1)
-    along = chord[:, 0] * np.cos(angle) + chord[:, 1] * np.sin(angle)
+    length, along, angle = _run(nodes, elements, radian)
     bad = np.flatnonzero(~(along > ALIGNED * length))
     if bad.size:
         k = bad[0]
-        turn = np.arctan2(chord[k, 1], chord[k, 0])
+        chord = nodes[elements[k, 1]] - nodes[elements[k, 0]]
+        turn = np.arctan2(chord[1], chord[0])
         problem = f"runs at {turn:.4g} radians, but its angle is {angle[k]:.4g}" if length[k] > 0 else "has no length"
         raise ValueError(
             f"nodes: element {k} {problem}; the third column is radian times the angle of the axis, and nodes must be "
@@ -133,9 +140,11 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     Raises:
         ValueError: if `nodes` is not a whole number of at least 2, or a length is not positive and finite.
     """
-    check_count("nodes", nodes)
-    check_length("length", length)
-    dtype = jnp.result_type(float) if dtype is None else dtype
+    checks.count("nodes", nodes, 2)
+    length, radian = (
+        checks.number(name, value, checks.POSITIVE) for name, value in (("length", length), ("radian", radian))
+    )
+    dtype = checks.float_dtype("dtype", dtype)
     unit = np.linspace(-0.5, 0.5, nodes)[:, None] * [1.0, 0.0, 0.0]
     pairs = np.stack([np.arange(nodes - 1), np.arange(1, nodes)], axis=1)
     return Line(unit.astype(dtype) * namespace(length).asarray(length, dtype), pairs, to_device(radian, dtype))
@@ -283,23 +292,24 @@ def rod(
     Raises:
         ValueError: if a concrete height is not positive and finite, or a parameter has another shape.
     """
-    count, dtype = line.elements.shape[0], line.nodes.dtype
+    checks.instance(
+        "line", line, Line, "make one with straight(length, radian, nodes) or Line(nodes, elements, radian)"
+    )
+    checks.function("density", density, "(H, params) -> scalar")
+    total, dtype = line.elements.shape[0], line.nodes.dtype
     xp = namespace(line.nodes, line.radian, height, *jax.tree.leaves(params))
-    if is_concrete(height) and not ((np.asarray(height) > 0) & np.isfinite(height)).all():
-        raise ValueError(f"height: expected positive finite numbers, got {height!r}")
 
-    def per_element(name: str, value: Numbers) -> jax.Array:
-        if np.shape(value) not in ((), (count,)):
-            raise ValueError(
-                f"{name}: expected a scalar or {count} entries, one for each element, got {np.shape(value)}"
-            )
-        return xp.broadcast_to(xp.asarray(value, dtype), (count,))
+    def per_element(name: str, value: Numbers, within: checks.Range = checks.FINITE) -> jax.Array:
+        values = checks.numbers(name, value, within, ((), (total,)), "one for each element")
+        return xp.broadcast_to(xp.asarray(values, dtype), (total,))
 
     material = jax.tree_util.tree_map_with_path(
         lambda path, leaf: per_element(f"params{jax.tree_util.keystr(path)}", leaf), params
     )
+    check_density(density, material)
     rest = xp.asarray(line.nodes)[line.elements]
-    every = RodParams(rest, per_element("radian", line.radian), per_element("height", height), material)
+    heights = per_element("height", height, checks.POSITIVE)
+    every = RodParams(rest, per_element("radian", line.radian), heights, material)
     return Term(RodEnergy(density), line.elements, every)
 
 
@@ -343,14 +353,11 @@ def rod_tendons(
         ValueError: if `eccentricity` has another shape or is not finite, or as `tendons` does.
     """
     # It checks the nodes and the modulus. Lengths are measured anew.
+    checks.instance("line", line, Line, "on a mesh of triangles use tendons")
     plain = tendons(line, nodes, modulus, stiffness)
-    if np.shape(eccentricity) not in ((), plain.nodes.shape):
-        raise ValueError(
-            f"eccentricity: expected a scalar or shape {plain.nodes.shape}, one for each point, got "
-            f"{np.shape(eccentricity)}"
-        )
-    if is_concrete(eccentricity) and not np.isfinite(np.asarray(eccentricity)).all():
-        raise ValueError(f"eccentricity: expected finite numbers, got {eccentricity!r}")
+    eccentricity = checks.numbers(
+        "eccentricity", eccentricity, shapes=((), plain.nodes.shape), each="one for each point"
+    )
     dtype, xp = line.nodes.dtype, namespace(line.nodes, line.radian, eccentricity)
     offsets = Offsets(
         xp.broadcast_to(xp.asarray(eccentricity, dtype), plain.nodes.shape),
@@ -407,12 +414,19 @@ def euler_bernoulli(
         An `Estimate`, differentiable in every real argument.
 
     Raises:
-        ValueError: if `ratios` has another shape.
+        ValueError: if an argument has another shape or a concrete one is outside its range, which is that of
+            `rod_beam`. Where a traced one is, the answer is NaN.
     """
-    if np.shape(ratios) != (2,):
-        raise ValueError(f"ratios: expected shape (2,), of the top and the bottom tendon, got {np.shape(ratios)}")
-    values = (ratios, length, height, young, poisson, tendon_modulus)
-    xp = namespace(*jax.tree.leaves(values))
+    values = (
+        checks.numbers("ratios", ratios, checks.POSITIVE, ((2,),), "of the top and the bottom tendon"),
+        checks.number("length", length, checks.POSITIVE),
+        checks.number("height", height, checks.POSITIVE),
+        checks.number("young", young, checks.POSITIVE),
+        checks.number("poisson", poisson, POISSON),
+        checks.numbers("tendon_modulus", tendon_modulus, checks.POSITIVE, ((), (2,))),
+    )
+    check_law(stiffness)
+    xp = namespace(*values)
     return _by_hand(*(xp.asarray(value) for value in values), stiffness)
 
 

@@ -8,16 +8,18 @@ Young's modulus x length (thickness is 1), energies in force x length.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, index_field, is_concrete, key_of, namespace, pytree, read_only, replace, to_device
 from jaxbeam.anchors import surface_of
 from jaxbeam.materials import Lame, lame, macklin_mueller
-from jaxbeam.mesh import Diagonals, Mesh, check_length, middle_column, rectangle, with_middles
+from jaxbeam.mesh import Diagonals, Mesh, middle_column, rectangle, with_middles
 from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
 from jaxbeam.stencils import admissible_step, stencil_gradients, stencil_hessian, volume_ratios
 from jaxbeam.terms import (
@@ -48,7 +50,7 @@ class Scene:
 
     Raises:
         ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a term's node is out of range,
-            or a term of solids acts on a rod.
+            a term of solids acts on a rod, or an energy returns no scalar.
     """
 
     mesh: Mesh
@@ -58,8 +60,13 @@ class Scene:
     surface: np.ndarray = index_field(init=False)
 
     def __post_init__(self) -> None:
+        checks.instance(
+            "mesh", self.mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)"
+        )
         shape = self.mesh.nodes.shape
-        fixed = np.asarray(self.fixed)
+        if not is_concrete(self.fixed, self.tip):
+            raise ValueError("fixed, tip: expected concrete arrays, got traced ones; choose nodes outside jit and grad")
+        fixed = checks.plain("fixed", self.fixed, f"booleans of shape {shape}")
         if fixed.shape != shape or fixed.dtype != bool:
             raise ValueError(
                 f"fixed: expected booleans of shape {shape}, got shape {fixed.shape} of dtype {fixed.dtype}; "
@@ -72,24 +79,50 @@ class Scene:
         for number, term in enumerate(self.terms):
             check_nodes(f"terms[{number}].nodes", self.mesh, term.nodes, ndim=2)
             energy = term.energy
+            _check_energy(number, term, self.mesh.nodes)
             of_solids = isinstance(energy, SolidEnergy) or (
                 isinstance(energy, TendonEnergy) and energy.points is not at_offsets
             )
             if isinstance(self.mesh, Line) and of_solids:
                 raise ValueError(f"terms[{number}]: it is made for solids; on a Line use rod and rod_tendons")
-        tip = np.asarray(self.tip)
-        if tip.size:
-            tip = check_nodes("tip", self.mesh, tip, ndim=1)
+        tip = check_nodes("tip", self.mesh, self.tip, ndim=1) if np.size(self.tip) else np.zeros(0)
         object.__setattr__(self, "fixed", read_only(fixed))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
         bodies = tuple(key_of(term, "nodes") for term in self.terms if isinstance(term.energy, SolidEnergy))
         object.__setattr__(self, "surface", surface_of(bodies))
 
 
+def _check_energy(number: int, term: Term, nodes: jax.Array) -> None:
+    """Refuse an energy of a user's own that returns no scalar."""
+    if isinstance(term.energy, SolidEnergy | RodEnergy | TendonEnergy):
+        return
+    leaves, structure = jax.tree.flatten(term.params)
+    shapes = [((term.nodes.shape[1], nodes.shape[1]), nodes.dtype), *((leaf.shape[1:], leaf.dtype) for leaf in leaves)]
+    _traced_once(f"terms[{number}].energy", term.energy, structure, tuple(shapes))
+
+
+@lru_cache(maxsize=64)
+def _traced_once(name: str, energy: Callable[..., jax.Array], structure: Any, shapes: tuple[Any, ...]) -> None:
+    x, *leaves = (jax.ShapeDtypeStruct(*each) for each in shapes)
+    checks.scalar(name, "(x, params)", energy, x, jax.tree.unflatten(structure, leaves))
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse what is not a scene."""
+    checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
+
+
+def placed(scene: Scene, x: Numbers, name: str = "x") -> jax.Array:
+    """Node positions `x` of a scene, checked."""
+    check_scene(scene)
+    return checks.positions(name, x, scene.mesh.nodes.shape, scene.mesh.nodes.dtype)
+
+
 def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
     """`(n, d)` booleans that fix every coordinate of `nodes` `(m,)`."""
+    where = check_nodes("nodes", mesh, nodes, ndim=1)
     fixed = np.zeros(mesh.nodes.shape, bool)
-    fixed[check_nodes("nodes", mesh, nodes, ndim=1)] = True
+    fixed[where] = True
     return fixed
 
 
@@ -142,6 +175,7 @@ def tendon_beam(
         ValueError: if `nx` is even and the mesh not graded, or as `rectangle`, `lame` and `tendons` do.
     """
     mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order, graded=graded)
+    anchor_width = checks.setting("anchor_width", anchor_width, checks.NOT_NEGATIVE)
     bottom_left, top_left = 0, ny - 1
     bottom_middle = middle_column(nx, graded) * ny
     body = solid(mesh, lame(young, poisson), density, degree)
@@ -185,7 +219,7 @@ def rod_beam(
     Raises:
         ValueError: if `nodes` is even, or as `lame`, `rod` and `rod_tendons` do.
     """
-    check_length("height", height)
+    height = checks.number("height", height, checks.POSITIVE)
     line = straight(length, height, nodes, dtype)
     if nodes % 2 == 0:
         raise ValueError(
@@ -209,16 +243,11 @@ def command(scene: Scene, ratios: Numbers) -> Scene:
     Raises:
         ValueError: if the count is wrong or a concrete ratio is not positive and finite.
     """
-    count = tendon_count(scene)
-    if np.shape(ratios) != (count,):
-        raise ValueError(f"ratios: expected shape ({count},), one for each tendon, got {np.shape(ratios)}")
+    check_scene(scene)
+    ratios = checks.shaped("ratios", ratios, ((tendon_count(scene),),), "one for each tendon")
+    # `is_valid` looks at traced ones: the commanded length is a parameter.
     if is_concrete(ratios):
-        array = np.asarray(ratios, float)
-        if not (np.isfinite(array) & (array > 0)).all():
-            raise ValueError(
-                f"ratios: expected positive finite numbers, got {array.tolist()}; 1 is the natural length and "
-                f"0.5 half of it"
-            )
+        checks.inside("ratios", ratios, checks.POSITIVE, why="1 is the natural length and 0.5 half of it")
     terms, start = [], 0
     for term in scene.terms:
         if isinstance(term.energy, TendonEnergy):
@@ -323,12 +352,13 @@ def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
 
 def energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Total energy `()` at node positions `x` `(n, 2)`; differentiable in the scene and in `x`."""
+    x = placed(scene, x)
     return sum((jnp.sum(jax.vmap(t.energy)(x[t.nodes], t.params)) for t in scene.terms), jnp.zeros((), x.dtype))
 
 
 def forces(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of all terms on each node: minus the gradient of the energy."""
-    return -evaluate(scene, x).gradient
+    return -evaluate(scene, placed(scene, x)).gradient
 
 
 def reactions(scene: Scene, x: jax.Array) -> jax.Array:
@@ -347,7 +377,7 @@ def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[j
 
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
     """Smallest `J = det F` `()` over the solids at `x`, or stretch of a fibre of the rods; infinite without any."""
-    return worst_element(scene, x)[0]
+    return worst_element(scene, placed(scene, x))[0]
 
 
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:

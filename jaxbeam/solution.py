@@ -7,6 +7,7 @@ import enum
 import jax
 import numpy as np
 
+from jaxbeam import checks
 from jaxbeam._tree import is_concrete, pytree
 
 
@@ -94,6 +95,7 @@ def check(solution: Solution) -> Solution:
             tolerance, steps, smallest `J` and where, the command, and what to try.
         ValueError: if the solution is traced: statuses have no value inside jit.
     """
+    checks.instance("solution", solution, Solution, "give what equilibrium, ramp or sweep returned")
     if not is_concrete(solution.status):
         raise ValueError("solution: expected concrete values, got traced ones; call check outside jit, vmap and grad")
     status = np.asarray(solution.status)

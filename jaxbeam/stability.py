@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, blank, pytree, unlock
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand
-from jaxbeam.newton import Newton, topology
-from jaxbeam.scene import Scene, stencil_hessians
+from jaxbeam.newton import Newton, check_asked, topology
+from jaxbeam.scene import Scene, placed, stencil_hessians
 
 # Subspace iteration: extra vectors beside the wanted ones, and the most turns it may take.
 GUARD = 4
@@ -51,13 +52,11 @@ def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newto
     Raises:
         ValueError: if `count` is not between 1 and the number of free coordinates, or `x` has another shape.
     """
-    free = int(np.sum(~scene.fixed))
-    if not isinstance(count, int | np.integer) or not 1 <= count <= free:
-        raise ValueError(f"count: expected a whole number from 1 to {free}, the free coordinates, got {count!r}")
-    if np.shape(x) != scene.mesh.nodes.shape:
-        raise ValueError(f"x: expected node positions of shape {scene.mesh.nodes.shape}, got {np.shape(x)}")
+    check_asked(scene, solver)
+    checks.count("count", count, 1, int(np.sum(~scene.fixed)), "the free coordinates")
+    x = placed(scene, x)
     layout = solver.linear.layout(topology(scene))
-    return _lowest_mode(unlock(scene), layout, jnp.asarray(x, scene.mesh.nodes.dtype), int(count), solver.linear)
+    return _lowest_mode(unlock(scene), layout, x.astype(scene.mesh.nodes.dtype), int(count), solver.linear)
 
 
 @partial(jax.jit, static_argnames=("count", "linear"))

@@ -23,12 +23,13 @@ import numpy as np
 from jax import lax
 from jax.sharding import PartitionSpec
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, blank, compiled, is_concrete, to_device, unlock
 from jaxbeam.equilibrium import differentiable_rows
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
 from jaxbeam.linear import Layout, expand, gather
-from jaxbeam.newton import Newton, topology
+from jaxbeam.newton import Newton, check_asked, topology
 from jaxbeam.predictor import STATES, Trail, ahead
 from jaxbeam.scene import Scene, command, energy, partway
 from jaxbeam.solution import Solution, Status
@@ -71,17 +72,19 @@ def sweep(
     Raises:
         ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
     """
-    shape = np.shape(ratios)
+    check_asked(scene, solver)
+    values = checks.shaped("ratios", ratios, None)
+    shape = values.shape
     if len(shape) != 2 or shape[0] == 0:
         raise ValueError(f"ratios: expected shape (B, m), a row for each command, got {shape}")
-    if is_concrete(ratios):
-        array = np.asarray(ratios, float)
-        bad = np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1))
-        if bad.size:
-            raise ValueError(f"ratios: expected positive finite numbers, got {array[bad[0]].tolist()} in row {bad[0]}")
+    # `is_valid` looks at traced ones.
+    if is_concrete(values):
+        checks.inside("ratios", values, checks.POSITIVE)
+    if progress is not None:
+        checks.function("progress", progress, "(solved, all)")
     check_held(scene)
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
-    rows = to_device(ratios, scene.mesh.nodes.dtype)
+    rows = to_device(values, scene.mesh.nodes.dtype)
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     size = min(CHUNK, max(1, MEMORY // (scene.mesh.nodes.size * (1 + shape[1]))))
     if is_concrete(rows, *jax.tree.leaves(scene)):

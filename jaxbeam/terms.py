@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam import checks
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, static_field, to_device
 from jaxbeam.anchors import patch
 from jaxbeam.elements import rule, shape_slopes
-from jaxbeam.materials import macklin_mueller
-from jaxbeam.mesh import Mesh
+from jaxbeam.materials import check_density, macklin_mueller
+from jaxbeam.mesh import Mesh, check_triangles
 
 
 @pytree
@@ -46,12 +47,14 @@ class Term:
     def __post_init__(self) -> None:
         if not callable(self.energy):
             raise ValueError(f"energy: expected a function (x, params) -> scalar, got {self.energy!r}")
-        nodes = np.asarray(self.nodes) if is_concrete(self.nodes) else None
+        wanted = "concrete whole numbers of shape (m, k)"
+        nodes = checks.plain("nodes", self.nodes, wanted) if is_concrete(self.nodes) else None
         if nodes is None or nodes.dtype.kind not in "iu" or nodes.ndim != 2 or 0 in nodes.shape:
             got = "a traced array" if nodes is None else f"shape {nodes.shape} of dtype {nodes.dtype}"
-            raise ValueError(f"nodes: expected concrete whole numbers of shape (m, k), got {got}")
+            raise ValueError(f"nodes: expected {wanted}, got {got}")
         object.__setattr__(self, "nodes", read_only(nodes, np.int32))
-        params = jax.tree.map(to_device, self.params)
+        named = lambda path, leaf: checks.parameter(f"params{jax.tree_util.keystr(path)}", leaf)
+        params = jax.tree.map(to_device, jax.tree_util.tree_map_with_path(named, self.params))
         for path, leaf in jax.tree_util.tree_leaves_with_path(params):
             if leaf.ndim == 0 or leaf.shape[0] != nodes.shape[0]:
                 raise ValueError(
@@ -120,25 +123,29 @@ def solid(
             points) for six.
 
     Raises:
-        ValueError: if a parameter is neither a scalar nor of leading axis `t`, or there is no rule of that degree.
+        ValueError: if a parameter is neither a scalar nor of leading axis `t` or is not finite, there is no rule of
+            that degree, or the density returns no scalar or is not that of `H = F - I`.
     """
-    count, dtype = mesh.elements.shape[0], mesh.nodes.dtype
+    check_triangles(mesh)
+    total, dtype = mesh.elements.shape[0], mesh.nodes.dtype
     xp = namespace(mesh.nodes, *jax.tree.leaves(params))
 
     def per_element(path: Any, value: Numbers) -> jax.Array:
-        array = xp.asarray(value, dtype)
+        name = f"params{jax.tree_util.keystr(path)}"
+        array = xp.asarray(checks.numbers(name, value), dtype)
         if array.ndim == 0:
-            return xp.full((count,), array)
-        if array.shape[0] != count:
+            return xp.full((total,), array)
+        if array.shape[0] != total:
             raise ValueError(
-                f"params{jax.tree_util.keystr(path)}: expected a scalar or {count} entries, one for each triangle, "
-                f"got shape {array.shape}"
+                f"{name}: expected a scalar or {total} entries, one for each triangle, got shape {array.shape}"
             )
         return array
 
     material = jax.tree_util.tree_map_with_path(per_element, params)
+    check_density(density, material)
     rest = xp.asarray(mesh.nodes)[mesh.elements]
-    points, shares = rule((1 if rest.shape[1] == 3 else 2) if degree is None else degree)
+    usual = 1 if rest.shape[1] == 3 else 2
+    points, shares = rule(usual if degree is None else checks.count("degree", degree, 1))
     # How a triangle is mapped from the reference one, and the inverse of that, at each point.
     slopes = xp.asarray(shape_slopes(rest.shape[1], points), dtype)
     map_ = xp.einsum("mkd,qki->mqdi", rest, slopes)
@@ -184,6 +191,17 @@ def inverse_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
 def constant_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
     """`k = modulus`: a spring whose stiffness does not depend on the command."""
     return modulus
+
+
+_LAWS = (inverse_square_stiffness, inverse_stiffness, constant_stiffness)
+
+
+def check_law(stiffness: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
+    """Refuse what is not a law of stiffness, a function of two numbers that returns one."""
+    form = "(modulus, commanded) -> k, such as inverse_square_stiffness"
+    checks.function("stiffness", stiffness, form)
+    if stiffness not in _LAWS:
+        checks.scalar("stiffness", form, stiffness, *2 * [jax.ShapeDtypeStruct((), jnp.result_type(float))])
 
 
 def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
@@ -251,6 +269,7 @@ def tendons(
         ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
             nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
     """
+    check_law(stiffness)
     lines = check_nodes("nodes", mesh, nodes, ndim=2)
     if lines.shape[1] < 2:
         raise ValueError(f"nodes: expected at least two nodes for each tendon, got shape {lines.shape}")
@@ -258,15 +277,11 @@ def tendons(
     if (np.diff(ordered, axis=1) == 0).any():
         k = int(np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))[0])
         raise ValueError(f"nodes: tendon {k} repeats a node: {lines[k].tolist()}; give each of its points once")
-    if is_concrete(modulus):
-        values = np.asarray(modulus, float)
-        if not (np.isfinite(values) & (values > 0)).all():
-            raise ValueError(f"modulus: expected positive finite numbers, got {modulus!r}")
-    if np.shape(modulus) not in ((), (lines.shape[0],)):
-        raise ValueError(f"modulus: expected a scalar or {lines.shape[0]} entries, got shape {np.shape(modulus)}")
-    widths = np.broadcast_to(np.asarray(width, float), lines.shape) if np.shape(width) in ((), lines.shape) else None
-    if widths is None or not (np.isfinite(widths) & (widths >= 0)).all():
-        raise ValueError(f"width: expected numbers of at least 0, a scalar or shape {lines.shape}, got {width!r}")
+    modulus = checks.numbers("modulus", modulus, checks.POSITIVE, ((), lines.shape[:1]))
+    if not is_concrete(width):
+        raise ValueError("width: expected known numbers, got traced ones; the nodes of a patch depend on its width")
+    tents = checks.numbers("width", width, checks.NOT_NEGATIVE, ((), lines.shape))
+    widths = np.broadcast_to(tents.astype(float), lines.shape)
     dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
     anchored: tuple[np.ndarray, ...] = ()
     if not widths.any():
@@ -333,10 +348,7 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     """
     where = check_nodes("nodes", mesh, nodes, ndim=1)
     d = mesh.nodes.shape[1]
-    if np.shape(force) not in ((d,), (where.size, d)):
-        raise ValueError(f"force: expected shape ({d},) or ({where.size}, {d}), got {np.shape(force)}")
-    if is_concrete(force) and not np.isfinite(np.asarray(force)).all():
-        raise ValueError(f"force: expected finite numbers, got {force!r}")
+    force = checks.numbers("force", force, shapes=((d,), (where.size, d)))
     xp, rest = namespace(force), namespace(mesh.nodes).asarray(mesh.nodes)[where]
     values = xp.broadcast_to(xp.asarray(force, mesh.nodes.dtype), (where.size, d))
     return Term(dead_load_energy, where[:, None], PointParams(rest, values))
@@ -357,12 +369,7 @@ def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
         ValueError: if a node is out of range, or `stiffness` has another shape or is negative or not finite.
     """
     where = check_nodes("nodes", mesh, nodes, ndim=1)
-    if np.shape(stiffness) not in ((), (where.size,)):
-        raise ValueError(f"stiffness: expected a scalar or {where.size} entries, got shape {np.shape(stiffness)}")
-    if is_concrete(stiffness):
-        array = np.asarray(stiffness, float)
-        if not (np.isfinite(array) & (array >= 0)).all():
-            raise ValueError(f"stiffness: expected finite numbers of at least 0, got {stiffness!r}")
+    stiffness = checks.numbers("stiffness", stiffness, checks.NOT_NEGATIVE, ((), (where.size,)))
     xp, rest = namespace(stiffness), namespace(mesh.nodes).asarray(mesh.nodes)[where]
     values = xp.broadcast_to(xp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
     return Term(penalty_energy, where[:, None], PointParams(rest, values))
@@ -370,14 +377,5 @@ def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
 
 def check_nodes(name: str, mesh: Mesh, nodes: Numbers, ndim: int) -> np.ndarray:
     """`nodes` as a concrete array of valid node numbers with `ndim` axes, or a `ValueError` that names it."""
-    if not is_concrete(nodes):
-        raise ValueError(f"{name}: expected concrete node numbers, got a traced array")
-    array = np.asarray(nodes)
-    if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
-        shape = "(m,)" if ndim == 1 else "(m, k)"
-        raise ValueError(f"{name}: expected whole numbers of shape {shape}, got shape {array.shape} of {array.dtype}")
-    count = mesh.nodes.shape[0]
-    outside = array[(array < 0) | (array >= count)]
-    if outside.size:
-        raise ValueError(f"{name}: {outside[0]} is out of range, nodes are numbered 0 to {count - 1}")
-    return array
+    checks.instance("mesh", mesh, Mesh, "a scene has it as scene.mesh")
+    return checks.node_numbers(name, mesh.nodes.shape[0], nodes, ndim)

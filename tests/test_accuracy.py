@@ -146,7 +146,7 @@ def test_patch_goes_round_corners_and_refuses_what_has_none():
         patch(mesh, jb.nearest_node(mesh, [0.0, 0.0]), 0.1)
     with pytest.raises(ValueError, match="shorter than the width"):
         patch(mesh, corner, 100.0)
-    with pytest.raises(ValueError, match="width: expected numbers of at least 0"):
+    with pytest.raises(ValueError, match="anchor_width: expected a finite number of at least 0"):
         jb.tendon_beam(5, 3, anchor_width=-1.0)
 
 
@@ -222,7 +222,7 @@ def test_nothing_is_certified_that_has_no_limit(coarse):
     assert found.bar == np.inf and "not OK" in found.reason
     with pytest.raises(ValueError, match="measure: expected a function that returns a scalar"):
         jb.estimate_error(scene, solution, jb.tendon_tensions)
-    with pytest.raises(ValueError, match="tolerance: expected a positive number"):
+    with pytest.raises(ValueError, match="tolerance: expected a positive finite number"):
         jb.solve_to(scene, jb.tip_angle, 0.0)
     with pytest.raises(ValueError, match="scene: expected concrete numbers"):
         jax.jit(lambda s: jb.enriched(s)[1].weights)(scene)

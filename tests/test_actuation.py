@@ -151,8 +151,8 @@ def test_sweep_reports_each_member():
         ([0.4, 1.0], r"ratios: expected shape \(B, m\), a row for each command, got \(2,\)"),
         (np.zeros((0, 2)), r"ratios: expected shape \(B, m\), a row for each command, got \(0, 2\)"),
         ([[0.4, 1.0, 1.0]], r"ratios: expected shape \(2,\), one for each tendon, got \(3,\)"),
-        ([[1.0, 1.0], [0.4, -1.0]], r"ratios: expected positive finite numbers, got \[0.4, -1.0\] in row 1"),
-        ([[np.nan, 1.0]], r"ratios: expected positive finite numbers, got \[nan, 1.0\] in row 0"),
+        ([[1.0, 1.0], [0.4, -1.0]], r"ratios: expected positive finite numbers, got \[\[1.0, 1.0\], \[0.4, -1.0\]\]"),
+        ([[np.nan, 1.0]], r"ratios: expected positive finite numbers, got \[\[nan, 1.0\]\]"),
     ],
 )
 def test_sweep_refuses(small, ratios, message):

@@ -263,9 +263,9 @@ def test_coarse_steps_stay_on_the_branch(beam, folded, mirrored, straight):
 def test_errors(beam):
     with pytest.raises(ValueError, match="direction: expected 1 or -1, got 0"):
         jb.trace_branch(beam, END, direction=0)
-    with pytest.raises(ValueError, match=r"expected step > 0 .* got step -1"):
+    with pytest.raises(ValueError, match=r"step: expected a positive finite number, got -1"):
         jb.trace_branch(beam, END, step=-1)
-    with pytest.raises(ValueError, match=r"got step 0.02, interval \(1.0, 0.0\), parameter 0.0"):
+    with pytest.raises(ValueError, match=r"got interval \(1.0, 0.0\), parameter 0.0"):
         jb.trace_branch(beam, END, interval=(1.0, 0.0))
     with pytest.raises(ValueError, match=r"interval\[0\] <= parameter <= interval\[1\], .* parameter 2"):
         jb.trace_branch(beam, END, parameter=2)

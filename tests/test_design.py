@@ -207,7 +207,7 @@ def test_in_float32():
         ({"bounds": (0.9, 0.4)}, "bounds: expected 0 < low <= high"),
         ({"bounds": ([0.4, 0.4, 0.4], 1.0)}, r"bounds: expected low of shape \(\) or \(2,\), got \(3,\)"),
         ({"starts": [1.0, 1.0]}, r"starts: expected shape \(S, 2\), a row for each start, got \(2,\)"),
-        ({"tolerance": 0.0}, "tolerance: expected a positive number, got 0.0"),
+        ({"tolerance": 0.0}, "tolerance: expected a positive finite number, got 0.0"),
         ({"measure": jb.tendon_lengths}, r"target: expected the shape \(2,\) of the measure, got \(\)"),
         ({"measure": lambda scene, x: x}, r"measure: expected a function \(scene, x\) to shape \(\) or \(p,\)"),
     ],

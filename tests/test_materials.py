@@ -247,15 +247,17 @@ def test_lame_differentiates():
 @pytest.mark.parametrize(
     ("young", "poisson", "message"),
     [
-        (0.0, 0.3, r"young: expected a value in \(0, inf\), got 0; a stiffness is positive"),
-        (-1.0, 0.3, r"young: expected a value in \(0, inf\), got -1"),
-        (np.inf, 0.3, r"young: expected a value in \(0, inf\), got inf"),
-        (np.nan, 0.3, r"young: expected a value in \(0, inf\), got nan"),
-        ("soft", 0.3, r"young: expected a real number or array, got 'soft'"),
-        ([1.0, -2.0], 0.3, r"young: expected a value in \(0, inf\), got -2 at element 1"),
+        (0.0, 0.3, r"young: expected positive finite numbers, got 0\.0; a stiffness is positive"),
+        (-1.0, 0.3, "young: expected positive finite numbers, got -1"),
+        (np.inf, 0.3, "young: expected positive finite numbers, got inf"),
+        (np.nan, 0.3, "young: expected positive finite numbers, got nan"),
+        ("soft", 0.3, "young: expected real numbers, got 'soft'; convert"),
+        ([1.0, -2.0], 0.3, r"young: expected positive finite numbers, got \[1\.0, -2\.0\]"),
+        (1.0 - 3 * (np.arange(9) == 4), 0.3, r"young: expected positive finite numbers, got -2\.0 at entry 4"),
         (1.0, 0.5, r"poisson: expected a value in \(-1, 0.5\), got 0.5; 0.5 is incompressible.*0.4999"),
         (1.0, -1.0, r"poisson: expected a value in \(-1, 0.5\), got -1"),
-        (1.0, np.array([0.3, 0.3, 0.7]), r"poisson: expected a value in \(-1, 0.5\), got 0.7 at element 2"),
+        (1.0, np.array([0.3, 0.7]), r"poisson: expected a value in \(-1, 0.5\), got \[0.3, 0.7\]"),
+        (np.ones(3), np.full(2, 0.3), r"poisson: expected a scalar or the shape of young, \(3,\), got \(2,\)"),
     ],
 )
 def test_lame_refuses(build, young, poisson, message):

@@ -201,7 +201,7 @@ def test_selection_refuses(predicate, message):
 
 @pytest.mark.parametrize("point", [[0.0], [0.0, np.nan], [[0.0, 0.0]], 1.0])
 def test_nearest_refuses(point):
-    with pytest.raises(ValueError, match="point: expected two finite coordinates, got"):
+    with pytest.raises(ValueError, match=r"point: expected (shape|finite)"):
         jb.nearest_node(jb.rectangle(2.0, 1.0, 3, 2), point)
 
 

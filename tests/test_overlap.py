@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import annulus, l_shape, rotation, small_beam
 
 import jaxbeam as jb
-from helpers import annulus, l_shape, rotation, small_beam
 from jaxbeam.anchors import surface
 from jaxbeam.overlap import crossing
 

@@ -558,6 +558,8 @@ def test_stress_is_zero_where_no_solid_reaches():
 def test_errors_name_the_argument(scene, states):
     with pytest.raises(ValueError, match=r"x: expected node positions of shape \(21, 2\), got \(3, 2\)"):
         plot.beam(scene, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"x: expected .*, got a Solution; give its positions, solution.x"):
+        plot.beam(scene, jb.Solution(*[scene.mesh.nodes] * len(dataclasses.fields(jb.Solution))))
     with pytest.raises(ValueError, match="x: some positions are not finite"):
         plot.beam(scene, np.full((21, 2), np.nan))
     with pytest.raises(ValueError, match=r"values: expected shape \(24,\), one for each element, got \(21,\)"):

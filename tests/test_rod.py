@@ -363,9 +363,9 @@ def test_one_clamped_node_holds_a_rod():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Line(np.zeros((3, 2)), [[0, 1]], 1.0), r"nodes: expected floats of shape \(n, 3\), .* \(3, 2\)"),
-        (lambda: Line(np.zeros((3, 3), int), [[0, 1]], 1.0), r"nodes: expected floats .* int64"),
-        (lambda: Line(LINE.nodes, [[0, 1, 2]], 1.0), r"elements: expected concrete whole .* \(m, 2\), .*\(1, 3\)"),
+        (lambda: Line(np.zeros((3, 2)), [[0, 1]], 1.0), r"nodes: expected shape \(n, 3\), got \(3, 2\); give one"),
+        (lambda: Line(jnp.zeros((3, 3), int), [[0, 1]], 1.0), r"nodes: expected floats, got dtype int64; convert"),
+        (lambda: Line(LINE.nodes, [[0, 1, 2]], 1.0), r"elements: expected shape \(m, 2\) with m >= 1, got \(1, 3\)"),
         (lambda: Line(LINE.nodes, [[0, 3]], 1.0), r"elements: element 0 is \[0, 3\], but nodes are numbered 0 to 2"),
         (lambda: Line(LINE.nodes, [[0, 1]], 1.0), "nodes: 1 belong to no element, the first is node 2; remove"),
         (lambda: Line(LINE.nodes, LINE.elements, 0.0), "radian: expected a positive finite number, got 0.0"),
