@@ -248,7 +248,8 @@ def main(out: Path) -> dict[str, float]:
     pulled = pull(lopsided)
     found = search(lopsided)
     print(
-        "\nstable equilibria at (0.4, 0.4)\n  energy        tip angle, deg   smallest J   found   first from       status"
+        "\nstable equilibria at (0.4, 0.4)\n"
+        "  energy        tip angle, deg   smallest J   found   first from       status"
     )
     for state, ratios, count in found:
         angle = float(tip_angle(lopsided, state.x))

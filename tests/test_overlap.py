@@ -90,7 +90,9 @@ def test_two_pieces():
     """Two separate squares: apart at rest, one moved into the other."""
     square = jb.rectangle(1.0, 1.0, 2, 2)
     nodes = np.asarray(square.nodes)
-    mesh = jb.Mesh(np.concatenate([nodes, nodes + [2.0, 0.1]]), np.concatenate([square.elements, square.elements + 4]))
+    mesh = jb.Mesh(
+        np.concatenate([nodes, nodes + np.array([2.0, 0.1])]), np.concatenate([square.elements, square.elements + 4])
+    )
     scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, [0, 1, 4, 5]))
     assert (np.asarray(crossed(scene, mesh.nodes)) == -1).all()
     moved = np.asarray(mesh.nodes) - np.repeat([[0.0, 0.0], [1.5, 0.0]], 4, axis=0)
