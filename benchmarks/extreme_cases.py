@@ -225,8 +225,12 @@ def seed(text: str) -> int:
 
 def build(group: Group, case: Case, dtype: str) -> tuple[jb.Scene, Problem]:
     """The scene, and the raw arrays that the verification starts from."""
-    raw = _rod(group, case, dtype) if group.kind == "rod" else _solid(group, case, dtype)
-    return scene_of(raw), raw
+    if group.kind == "rod":
+        raw = _rod(group, case, dtype)
+        return scene_of(raw, np.array([group.nx - 1])), raw
+    raw = _solid(group, case, dtype)
+    column = middle_column(group.nx, group.graded) if group.kind == "both ends" else group.nx - 1
+    return scene_of(raw, column * group.ny + np.arange(group.ny)), raw
 
 
 def _solid(group: Group, case: Case, dtype: str) -> Problem:

@@ -147,9 +147,9 @@ LAWS = {
 }
 
 
-def scene_of(raw: Problem) -> jb.Scene:
-    """The library's scene of the judge's raw arrays, at natural lengths. Its tip are the nodes farthest from the clamp,
-    which are as far in any frame."""
+def scene_of(raw: Problem, tip: np.ndarray | None = None) -> jb.Scene:
+    """The library's scene of the judge's raw arrays, at natural lengths. By default its tip are the nodes farthest from
+    the clamp, which are as far in any frame."""
     material, density = jb.lame(raw.young, raw.poisson), getattr(jb, raw.material)
     if raw.is_rod:
         mesh: jb.Mesh = Line(raw.nodes, raw.elements, raw.radian)
@@ -161,8 +161,9 @@ def scene_of(raw: Problem) -> jb.Scene:
         pulls = [jb.tendons(mesh, t.lines, t.modulus, LAWS[t.law], t.widths) for t in raw.tendons]
     loaded = np.flatnonzero(np.zeros(len(raw.nodes)) if raw.load is None else raw.load.any(axis=1))
     loads = [jb.dead_load(mesh, loaded, raw.load[loaded])] if loaded.size else []
-    away = np.linalg.norm((raw.rest - raw.rest[raw.fixed[:, 0]].mean(axis=0))[:, :2], axis=1)
-    tip = np.flatnonzero(away > (1 - 1e-4) * away.max())
+    if tip is None:
+        away = np.linalg.norm((raw.rest - raw.rest[raw.fixed[:, 0]].mean(axis=0))[:, :2], axis=1)
+        tip = np.flatnonzero(away > (1 - 1e-4) * away.max())
     return jb.Scene(mesh, (body, *pulls, *loads), raw.fixed, tip)
 
 
