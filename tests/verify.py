@@ -14,7 +14,7 @@ What counts as round-off, with `eps` that of the dtype of the solve and `K` the 
 - energies: `16 eps` of the magnitudes added up and of forces times positions, `max K_ii (eps max |x|)^2` for each
   coordinate, and, as the form in `F` cancels where that in `H` does not, `16 eps` of float64 of the moduli times areas;
 - `J`: positions are rounded by `eps max |x|`, which moves `J` by that over the height of the element;
-- slopes: `SLOPE`, and `eps` times the condition number of `K`;
+- slopes: `SLOPE`, and what positions are rounded by, over the size of the body, times the condition number of `K`;
 - crossings: an end of an edge that is as near to the other as `tests/geometry.py` says leaves it open.
 """
 
@@ -253,8 +253,9 @@ def refuted_slope(problem: Problem, ratios: np.ndarray, x: np.ndarray, tip: np.n
     moves[free] = -scipy.linalg.cho_solve((factor, True), command_forces(problem, ratios, x))
     slope = moves[np.asarray(tip)].mean(axis=0)[: claimed.shape[0]]
     inverse, _ = scipy.linalg.lapack.dpocon(factor, np.abs(true.hessian).sum(axis=0).max(), uplo="L")
-    noise = float(np.finfo(dtype).eps) / inverse * np.abs(moves).max()
-    apart = np.abs(claimed - slope).max()
-    if not apart <= SLOPE * np.abs(slope).max() + noise:
-        return [f"slope off by {apart / np.abs(slope).max():.3g} of itself, where {noise:.3g} is round-off"]
+    rounded = float(np.finfo(dtype).eps) * max(1.0, float(np.abs(np.asarray(x)).max()) / problem.size)
+    noise = rounded / inverse * np.abs(moves).max()
+    apart, largest = np.abs(claimed - slope).max(), np.abs(slope).max()
+    if not apart <= SLOPE * largest + noise:
+        return [f"slope off by {apart / largest:.3g} of itself, of which {noise / largest:.3g} may be round-off"]
     return []
