@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import jaxbeam as jb
-from tests.verify import Problem, facts
+from tests.verify import Problem, Tendons, facts
 
 NX, NY, LENGTH, HEIGHT = 29, 7, 3.5, 0.8
 YOUNG, POISSON, TENDON_MODULUS = 1e4, 0.45, 2e3
@@ -33,9 +33,7 @@ def problem(scene: jb.Scene) -> Problem:
         young=YOUNG,
         poisson=POISSON,
         material="macklin_mueller",
-        tendons=np.asarray(scene.terms[1].nodes),
-        modulus=TENDON_MODULUS,
-        law="inverse-square",
+        tendons=(Tendons(np.asarray(scene.terms[1].nodes), TENDON_MODULUS, "inverse-square"),),
     )
 
 

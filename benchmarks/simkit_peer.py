@@ -96,7 +96,7 @@ def build(nx: int = reference.NX, ny: int = reference.NY) -> Beam:
     mu, lam = simkit.ympr_to_lame(reference.YOUNG, reference.POISSON)
     held = np.flatnonzero(np.asarray(raw.fixed).all(axis=1))
     clamp, clamp_force = simkit.dirichlet_penalty(held, nodes[held], len(nodes), PENALTY)
-    edges = simkit.edge_displacement_jacobian(nodes, raw.tendons)
+    edges = simkit.edge_displacement_jacobian(nodes, raw.tendons[0].lines)
     return Beam(
         raw=raw,
         gradient=simkit.deformation_jacobian(nodes, elements),
@@ -107,7 +107,7 @@ def build(nx: int = reference.NX, ny: int = reference.NY) -> Beam:
         clamp_force=clamp_force,
         clamp_energy=0.5 * PENALTY * float(np.sum(nodes[held] ** 2)),
         edges=scipy.sparse.kron(edges, scipy.sparse.identity(2)).tocsc(),
-        weights=np.ones((len(raw.tendons), 1)),
+        weights=np.ones((len(raw.tendons[0].lines), 1)),
     )
 
 
@@ -163,7 +163,7 @@ class Path(NamedTuple):
 def follow(ratios: tuple[float, ...], steps: int = reference.STEPS, settings: Settings = Settings()) -> Path:
     """The solve alone, pose by pose, of a ramp from rest to `ratios`: what is timed."""
     beam = build()
-    nodes, lines = beam.raw.nodes, beam.raw.tendons
+    nodes, lines = beam.raw.nodes, beam.raw.tendons[0].lines
     natural = np.linalg.norm(nodes[lines[:, 0]] - nodes[lines[:, 1]], axis=1)
     x = nodes.reshape(-1, 1).copy()
     states, reports = [x], []
@@ -191,7 +191,7 @@ def judge(path: Path, ratios: tuple[float, ...], seconds: float, settings: Setti
         residuals=[reference.residual(raw, row, x) for row, x in zip(way, states, strict=True)],
         x=end,
         tip_angle=reference.tip_angle(raw, end),
-        tendon_lengths=np.linalg.norm(end[raw.tendons[:, 0]] - end[raw.tendons[:, 1]], axis=1),
+        tendon_lengths=np.linalg.norm(end[raw.tendons[0].lines[:, 0]] - end[raw.tendons[0].lines[:, 1]], axis=1),
     )
 
 

@@ -14,6 +14,8 @@ from scipy.special import lambertw
 
 import jaxbeam as jb
 from jaxbeam.chain import Topology
+from jaxbeam.rod import Line, rod, rod_tendons
+from tests.energies import Problem
 
 EPS = np.finfo(np.float64).eps
 
@@ -136,6 +138,33 @@ def random_scene(mesh: jb.Mesh, lines: list[list[int]], kind: str = "left", seed
     threads = [jb.tendons(mesh, [line], rng.uniform(1, 5), jb.inverse_stiffness) for line in lines]
     load = jb.dead_load(mesh, loaded, 0.01 * rng.normal(size=(3, 2)))
     return jb.Scene(mesh, (body, *threads, load), supports(mesh, kind))
+
+
+LAWS = {
+    "inverse-square": jb.inverse_square_stiffness,
+    "inverse": jb.inverse_stiffness,
+    "constant": jb.constant_stiffness,
+}
+
+
+def scene_of(raw: Problem, tip: np.ndarray | None = None) -> jb.Scene:
+    """The library's scene of the judge's raw arrays, at natural lengths. By default its tip are the nodes farthest from
+    the clamp, which are as far in any frame."""
+    material, density = jb.lame(raw.young, raw.poisson), getattr(jb, raw.material)
+    if raw.is_rod:
+        mesh: jb.Mesh = Line(raw.nodes, raw.elements, raw.radian)
+        body = rod(mesh, raw.height, material, density)
+        pulls = [rod_tendons(mesh, t.lines, t.aside, t.modulus, LAWS[t.law]) for t in raw.tendons]
+    else:
+        mesh = jb.Mesh(raw.nodes, raw.elements)
+        body = jb.solid(mesh, material, density)
+        pulls = [jb.tendons(mesh, t.lines, t.modulus, LAWS[t.law], t.widths) for t in raw.tendons]
+    loaded = np.flatnonzero(np.zeros(len(raw.nodes)) if raw.load is None else raw.load.any(axis=1))
+    loads = [jb.dead_load(mesh, loaded, raw.load[loaded])] if loaded.size else []
+    if tip is None:
+        away = np.linalg.norm((raw.rest - raw.rest[raw.fixed[:, 0]].mean(axis=0))[:, :2], axis=1)
+        tip = np.flatnonzero(away > (1 - 1e-4) * away.max())
+    return jb.Scene(mesh, (body, *pulls, *loads), raw.fixed, tip)
 
 
 # --------------------------------------------------------------------------- references made otherwise

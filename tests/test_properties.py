@@ -11,17 +11,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from helpers import scene_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from verify import Problem, density, facts, total_energy, verify
 
 import jaxbeam as jb
-
-LAWS = {
-    "inverse-square": jb.inverse_square_stiffness,
-    "inverse": jb.inverse_stiffness,
-    "constant": jb.constant_stiffness,
-}
+from tests.verify import Problem, Tendons, density, facts, total_energy, verify
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,22 +125,8 @@ def problem(drawn: Drawn) -> Problem:
         young,
         poisson,
         program.material,
-        number[lines],
-        modulus,
-        program.law,
+        (Tendons(number[lines], modulus, program.law),),
     )
-
-
-def scene_of(raw: Problem) -> jb.Scene:
-    """The library's scene of raw arrays, at natural lengths."""
-    mesh = jb.Mesh(raw.nodes, raw.elements)
-    body = jb.solid(mesh, jb.lame(raw.young, raw.poisson), getattr(jb, raw.material))
-    threads = jb.tendons(mesh, raw.tendons, raw.modulus, LAWS[raw.law])
-    clamp = np.flatnonzero(raw.fixed[:, 0])
-    # The tip: the corners far from the clamp, which are as far in any frame.
-    away = np.linalg.norm(raw.nodes - raw.nodes[clamp].mean(axis=0), axis=1)
-    tip = np.flatnonzero(away > (1 - 1e-4) * away.max())
-    return jb.Scene(mesh, (body, threads), jb.clamped(mesh, clamp), tip)
 
 
 def assert_claims_hold(drawn: Drawn) -> None:
@@ -226,7 +207,7 @@ def test_answer_does_not_depend_on_the_numbering(drawn, seed):
         fixed=raw.fixed[order],
         young=raw.young[triangles],
         poisson=raw.poisson[triangles],
-        tendons=number[raw.tendons][::-1],
+        tendons=tuple(dataclasses.replace(t, lines=number[t.lines][::-1]) for t in raw.tendons),
     )
     _, x = solved(raw, drawn.ratios)
     _, x_shuffled = solved(shuffled, drawn.ratios[::-1])
@@ -251,9 +232,8 @@ def test_mirror_image_of_a_scene_has_the_mirror_image_of_its_answer(drawn):
 def test_answer_does_not_depend_on_units(drawn, length, stress):
     raw = problem(drawn)
     # The modulus of the inverse-square law is a force times a length, and a force is a stress times a length.
-    other = dataclasses.replace(
-        raw, nodes=raw.nodes * length, young=raw.young * stress, modulus=raw.modulus * stress * length**2
-    )
+    pulls = tuple(dataclasses.replace(t, modulus=t.modulus * stress * length**2) for t in raw.tendons)
+    other = dataclasses.replace(raw, nodes=raw.nodes * length, young=raw.young * stress, tendons=pulls)
     _, x = solved(raw, drawn.ratios)
     _, x_other = solved(other, drawn.ratios)
     np.testing.assert_allclose(x_other / length, x, rtol=0, atol=SAME)
@@ -265,13 +245,14 @@ def test_answer_does_not_depend_on_units(drawn, length, stress):
 def test_verifier_has_the_hessian_of_its_own_energy():
     raw, ratios = problem(Drawn(PROGRAMS[3], 1, (0.5, 1.2), spread=0.5, jitter=0.1)), np.array([0.5, 1.2])
     x = raw.nodes + 0.01 * np.random.default_rng(0).normal(size=raw.nodes.shape) * ~raw.fixed
-    flat = lambda y: total_energy(y.reshape(raw.nodes.shape), raw.arrays(ratios), raw.material)
+    # Positions are taken from the first node: the energy does not depend on the origin.
+    kinds, y = raw.stencils(ratios), raw.relative(x)
+    flat = lambda y: total_energy(y.reshape(raw.nodes.shape), kinds)
     free = ~raw.fixed.ravel()
     true = facts(raw, ratios, x)
-    np.testing.assert_allclose(
-        true.hessian, jax.jit(jax.hessian(flat))(x.ravel())[np.ix_(free, free)], atol=1e-12 * true.stiffest
-    )
-    np.testing.assert_allclose(true.gradient, jax.jit(jax.grad(flat))(x.ravel())[free], atol=1e-12 * true.scale)
+    hessian = jax.jit(jax.hessian(flat))(y.ravel())[np.ix_(free, free)]
+    np.testing.assert_allclose(true.hessian, hessian, atol=1e-12 * true.stiffest)
+    np.testing.assert_allclose(true.gradient, jax.jit(jax.grad(flat))(y.ravel())[free], atol=1e-12 * true.scale)
 
 
 @pytest.mark.parametrize("material", ["macklin_mueller", "neo_hookean", "saint_venant_kirchhoff", "linear_elastic"])

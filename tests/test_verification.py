@@ -4,17 +4,10 @@ What is solved and where the reference values come from is written there; it pri
 asserted here.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import jaxbeam as jb
-
-# The benchmarks are no part of the package: a plain `pytest` finds them only from here.
-sys.path.append(str(Path(__file__).parents[1]))
-
 from benchmarks import verification
 
 # Corners along the slender beams: enough for the errors below, and one shape for all of them.

@@ -1,0 +1,391 @@
+"""The energies of jaxbeam written anew, from raw arrays, by code that shares nothing with the package.
+
+In the most direct form: in the deformation gradient `F` and not in `H = F - I`, shape functions differentiated by JAX,
+always in float64. Positions are taken from the first node, so that it does not matter where the body lies. Forces and
+Hessians follow by automatic differentiation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tests.geometry import SIDES, determinants, patch, volumes
+
+POWERS = {"constant": 0.0, "inverse": 1.0, "inverse-square": 2.0}
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tendons:
+    """A group of `m` tendons through `p` points each, of one stiffness law, `k = modulus / wanted length ** power`.
+
+    lines: `(m, p)` node numbers. modulus: `(m,)` or scalar. widths: `(m, p)` or scalar, of the patches of surface that
+    points stand for. aside: `(m, p)` or scalar, on a rod the distance of points from the axis, to its left.
+    """
+
+    lines: np.ndarray
+    modulus: Any
+    law: str
+    widths: Any = 0.0
+    aside: Any = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A scene as raw arrays: `n` nodes, `t` elements, groups of tendons.
+
+    nodes: `(n, 2)`, of a rod `(n, 3)`. elements: `(t, 3)` or `(t, 6)`, of a rod `(t, 2)`. fixed: like `nodes`.
+    young, poisson: `(t,)` or scalars. corrected: whether `lam` is raised by `mu`. load: dead forces like `nodes`.
+    height, radian: of the section of a rod, and the length that stands for a radian in the third column.
+    """
+
+    nodes: np.ndarray
+    elements: np.ndarray
+    fixed: np.ndarray
+    young: Any
+    poisson: Any
+    material: str
+    tendons: tuple[Tendons, ...]
+    corrected: bool = False
+    load: np.ndarray | None = None
+    height: float = 0.0
+    radian: float = 1.0
+
+    @property
+    def is_rod(self) -> bool:
+        return np.shape(self.elements)[1] == 2
+
+    @property
+    def size(self) -> float:
+        """Of the body: its largest extent at rest."""
+        return float(np.ptp(np.asarray(self.nodes, np.float64)[:, :2], axis=0).max())
+
+    @cached_property
+    def rest(self) -> np.ndarray:
+        """Rest positions in float64, from the first node."""
+        return self.relative(self.nodes)
+
+    @cached_property
+    def centred(self) -> Problem:
+        """The same with the first node at the origin, in float64."""
+        return dataclasses.replace(self, nodes=self.rest)
+
+    def relative(self, x: np.ndarray) -> np.ndarray:
+        """Positions from the first node at rest. The third column of a rod is an angle, and stays."""
+        x, origin = np.array(x, np.float64), np.array(self.nodes, np.float64)[0]
+        x[:, :2] -= origin[:2]
+        return x
+
+    @cached_property
+    def lame(self) -> tuple[np.ndarray, np.ndarray]:
+        """`mu` and `lam` of each element."""
+        count = len(self.elements)
+        young, poisson = (np.broadcast_to(np.asarray(v, np.float64), count) for v in (self.young, self.poisson))
+        mu = young / 2 / (1 + poisson)
+        return mu, 2 * mu * poisson / (1 - 2 * poisson) + (mu if self.corrected else 0)
+
+    @cached_property
+    def bodies(self) -> list[Stencils]:
+        """What does not depend on the command."""
+        elements, (mu, lam) = np.asarray(self.elements), self.lame
+        corners = self.rest[elements]
+        if self.is_rod:
+            section = [np.full(len(elements), float(value)) for value in (self.radian, self.height)]
+            found = [Stencils(rod_of(self.material), elements, (corners, *section, mu, lam))]
+        else:
+            found = [Stencils(element_of(self.material), elements, (corners, mu, lam))]
+        if self.load is not None:
+            loaded = np.flatnonzero(np.any(self.load, axis=1))
+            force = np.asarray(self.load, np.float64)[loaded]
+            found.append(Stencils(load_energy, loaded[:, None], (self.rest[loaded], force)))
+        return found
+
+    @cached_property
+    def threads(self) -> list[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Of each group the nodes `(m, k)`, and weights, `aside`, `radian`, modulus, natural length and power."""
+        return [_attached(self, group) for group in self.tendons]
+
+    def stencils(self, ratios: np.ndarray, loaded: float = 1.0) -> list[Stencils]:
+        """All that stores energy under the commands `(m,)`, with a share of the dead loads."""
+        found, start = list(self.bodies), 0
+        if self.load is not None:
+            found[-1] = found[-1]._replace(params=(found[-1].params[0], loaded * found[-1].params[1]))
+        for nodes, params in self.threads:
+            commanded = np.asarray(ratios, np.float64)[start : start + len(nodes)]
+            found.append(Stencils(tendon_energy, nodes, (*params, commanded)))
+            start += len(nodes)
+        return found
+
+
+class Stencils(NamedTuple):
+    """Stencils of one energy `(x, *params) -> scalar`: their nodes `(m, k)`, and parameters with leading axis `m`."""
+
+    energy: Callable[..., jax.Array]
+    nodes: np.ndarray
+    params: tuple[np.ndarray, ...]
+
+
+# ------------------------------------------------------------------------------------------------ solids
+
+
+def density(F: jax.Array, mu: jax.Array, lam: jax.Array, material: str) -> jax.Array:
+    """Energy per area at rest, from the deformation gradient `F` `(2, 2)`."""
+    J, C = jnp.linalg.det(F), F.T @ F
+    if material == "macklin_mueller":
+        return mu / 2 * (jnp.trace(C) - 2) - mu * (J - 1) + lam / 2 * (J - 1) ** 2
+    if material == "neo_hookean":
+        return mu / 2 * (jnp.trace(C) - 2) - mu * jnp.log(J) + lam / 2 * jnp.log(J) ** 2
+    strain = {"saint_venant_kirchhoff": (C - jnp.eye(2)) / 2, "linear_elastic": (F + F.T) / 2 - jnp.eye(2)}[material]
+    return mu * jnp.trace(strain @ strain) + lam / 2 * jnp.trace(strain) ** 2
+
+
+def shapes(l: jax.Array, count: int) -> jax.Array:  # noqa: E741
+    """Values of the shape functions at barycentric coordinates `(1 - l[0] - l[1], l[0], l[1])`."""
+    l = jnp.stack([1 - l[0] - l[1], l[0], l[1]])  # noqa: E741
+    if count == 3:
+        return l
+    return jnp.concatenate([l * (2 * l - 1), jnp.stack([4 * l[a] * l[b] for a, b in SIDES])])
+
+
+@lru_cache
+def element_of(material: str) -> Callable[..., jax.Array]:
+    """The energy of a triangle: one point of quadrature for three nodes, three points of degree 2 for six."""
+
+    def energy(x: jax.Array, rest: jax.Array, mu: jax.Array, lam: jax.Array) -> jax.Array:
+        points = [[1 / 3, 1 / 3]] if len(x) == 3 else [[1 / 6, 1 / 6], [2 / 3, 1 / 6], [1 / 6, 2 / 3]]
+        total = 0.0
+        for point in points:
+            by = jax.jacfwd(shapes)(jnp.array(point), len(x))
+            map_ = (rest - rest[0]).T @ by
+            F = (x - x[0]).T @ by @ jnp.linalg.inv(map_)
+            total += jnp.linalg.det(map_) / 2 * density(F, mu, lam, material)
+        return total / len(points)
+
+    return energy
+
+
+# ------------------------------------------------------------------------------------------------- rods
+
+
+def fibre(a: jax.Array, mu: jax.Array, lam: jax.Array, material: str) -> jax.Array:
+    """Energy of a fibre stretched to `a` whose stress across vanishes, by the stretch `b` across in closed form.
+
+    For `neo_hookean` `u = ln b` solves `mu (exp 2u - 1) + lam (ln a + u) = 0`, which is convex in `u`: Newton's method
+    from the right of the root. Two more steps, which are differentiated, make its first two derivatives exact.
+    """
+    if material == "macklin_mueller":
+        b = (lam + mu) * a / (mu + lam * a**2)
+    elif material == "linear_elastic":
+        b = 1 - lam / (lam + 2 * mu) * (a - 1)
+    else:
+        assert material == "neo_hookean", material
+        step = lambda u, a: u - (mu * jnp.expm1(2 * u) + lam * (jnp.log(a) + u)) / (2 * mu * jnp.exp(2 * u) + lam)
+        fixed = jax.lax.stop_gradient(a)
+        u = jax.lax.fori_loop(0, 40, lambda _, u: step(u, fixed), jnp.maximum(0.0, -jnp.log(fixed)))
+        b = jnp.exp(step(step(jax.lax.stop_gradient(u), a), a))
+    return density(jnp.diag(jnp.stack([a, b])), mu, lam, material)
+
+
+@lru_cache
+def rod_of(material: str) -> Callable[..., jax.Array]:
+    """The energy of an element of a rod: fibres at three heights, and shear with the coefficient 5/6."""
+
+    def energy(x: Any, rest: Any, radian: Any, height: Any, mu: Any, lam: Any) -> jax.Array:
+        (eps, gamma, kappa), length = rod_strains(x, rest, radian)
+        along = 0.0
+        for place, share in ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18)):
+            along += share * fibre(1 + eps - place * height / 2 * kappa, mu, lam, material)
+        return length * height * (along + 0.5 * 5 / 6 * mu * gamma**2)
+
+    return energy
+
+
+def rod_strains(x: Any, rest: Any, radian: Any) -> tuple[tuple[Any, Any, Any], Any]:
+    """`(eps, gamma, kappa)` at the middle of an element with nodes `x` `(2, 3)`, less those at rest; its length."""
+
+    def local(y: Any, length: Any) -> Any:
+        angle = (y[0, 2] + y[1, 2]) / 2 / radian
+        dx, dy = (y[1, 0] - y[0, 0]) / length, (y[1, 1] - y[0, 1]) / length
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return c * dx + s * dy, c * dy - s * dx, (y[1, 2] - y[0, 2]) / radian / length
+
+    length = jnp.hypot(rest[1, 0] - rest[0, 0], rest[1, 1] - rest[0, 1])
+    pairs = zip(local(x, length), local(rest, length), strict=True)
+    eps, gamma, kappa = (now - before for now, before in pairs)
+    return (eps, gamma, kappa), length
+
+
+@jax.jit
+def _fibres(x: jax.Array, rest: jax.Array, radian: jax.Array, height: jax.Array) -> jax.Array:
+    def one(x: Any, rest: Any, radian: Any, height: Any) -> jax.Array:
+        (eps, _, kappa), _ = rod_strains(x, rest, radian)
+        return 1 + eps - jnp.abs(height / 2 * kappa)
+
+    return jax.vmap(one)(x, rest, radian, height)
+
+
+# ----------------------------------------------------------------------------------- tendons and loads
+
+
+def _attached(problem: Problem, group: Tendons) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Nodes `(m, k)` and parameters of a group but its command."""
+    lines = np.asarray(group.lines)
+    widths, aside = (np.broadcast_to(np.asarray(v, float), lines.shape) for v in (group.widths, group.aside))
+    if widths.any():
+        ends = zip(lines.ravel(), widths.ravel(), strict=True)
+        dense = np.stack([patch(problem.rest, problem.elements, *pair) for pair in ends])
+        dense = dense.reshape(*lines.shape, -1)
+        nodes = np.argsort(-np.any(dense, axis=1).astype(int), axis=1, kind="stable")
+        nodes = nodes[:, : int(np.any(dense, axis=1).sum(axis=1).max())]
+        weights = np.take_along_axis(dense, nodes[:, None], axis=2)
+    else:
+        nodes, weights = lines, np.tile(np.eye(lines.shape[1]), (len(lines), 1, 1))
+    radian = np.full(len(lines), float(problem.radian))
+    natural = np.asarray(_lengths(problem.rest[nodes], weights, aside, radian))
+    modulus = np.broadcast_to(np.asarray(group.modulus, np.float64), natural.shape)
+    return nodes, (weights, aside, radian, modulus, natural, np.full(len(lines), POWERS[group.law]))
+
+
+@jax.jit
+@jax.vmap
+def _lengths(x: jax.Array, weights: jax.Array, aside: jax.Array, radian: jax.Array) -> jax.Array:
+    return jnp.linalg.norm(jnp.diff(_points(x, weights, aside, radian), axis=0), axis=1).sum()
+
+
+def _points(x: jax.Array, weights: jax.Array, aside: jax.Array, radian: jax.Array) -> jax.Array:
+    """Points `(p, 2)` of a tendon: means of its nodes, and on a rod beside the axis."""
+    mean = weights @ x
+    if x.shape[1] == 2:
+        return mean
+    angle = mean[:, 2] / radian
+    return mean[:, :2] + aside[:, None] * jnp.stack([-jnp.sin(angle), jnp.cos(angle)], axis=1)
+
+
+def tendon_energy(
+    x: jax.Array, weights: Any, aside: Any, radian: Any, modulus: Any, natural: Any, power: Any, ratio: Any
+) -> jax.Array:
+    """`1/2 k (l - l*)^2`. A segment of no length has no direction, and none is given."""
+    edge = jnp.diff(_points(x, weights, aside, radian), axis=0)
+    meet = jnp.all(edge == 0, axis=1)
+    length = jnp.sum(jnp.where(meet, 0, jnp.linalg.norm(jnp.where(meet[:, None], 1.0, edge), axis=1)))
+    wanted = ratio * natural
+    return modulus / wanted**power / 2 * (length - wanted) ** 2
+
+
+def load_energy(x: jax.Array, rest: jax.Array, force: jax.Array) -> jax.Array:
+    """`-f . (x - X)` of one node `(1, d)`."""
+    return -jnp.sum(force * (x[0] - rest))
+
+
+# --------------------------------------------------------------------------------------- all of it at x
+
+
+@partial(jax.jit, static_argnames="energy")
+def _derivatives(energy: Any, x: jax.Array, params: Any) -> Any:
+    """Energies and gradients of stencils, and their Hessians."""
+    return jax.vmap(jax.value_and_grad(energy))(x, *params), jax.vmap(jax.hessian(energy))(x, *params)
+
+
+@jax.jit
+def _by_command(x: jax.Array, params: Any) -> jax.Array:
+    """Derivatives `(m, k, d)` of the gradients of tendons in their commands."""
+    return jax.vmap(jax.jacfwd(jax.grad(tendon_energy), argnums=7))(x, *params)
+
+
+def total_energy(x: jax.Array, stencils: list[Stencils]) -> jax.Array:
+    """Energy of all stencils at positions `x` `(n, d)` from the first node."""
+    return sum(jnp.sum(jax.vmap(s.energy)(x[s.nodes], *s.params)) for s in stencils)
+
+
+class Facts(NamedTuple):
+    """What is true at `x`.
+
+    energy_scale and scale_sum are sums of magnitudes, over all coordinates. scale is the largest sum of magnitudes of
+    the forces at one free coordinate, and stiffest the largest diagonal entry of the Hessian there. gradient and
+    hessian are over free coordinates. volumes are the least `J` of each element and bounds under it, of a rod the least
+    stretch of a fibre; heights `(t,)` those of elements at rest.
+    """
+
+    energy: float
+    energy_scale: float
+    cancelled: float
+    unbalanced: float
+    gradient: np.ndarray
+    scale: float
+    scale_sum: float
+    hessian: np.ndarray | None
+    stiffest: float
+    volumes: np.ndarray
+    bounds: np.ndarray
+    heights: np.ndarray
+
+
+def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = True, loaded: float = 1.0) -> Facts:
+    """Energy, forces and, if asked for, the dense Hessian at `x` `(n, d)`."""
+    y, free = problem.relative(x), ~np.asarray(problem.fixed).ravel()
+    d = y.shape[1]
+    gradient, scale, diagonal = np.zeros(y.shape), np.zeros(y.shape), np.zeros(y.size)
+    hessian = np.zeros((y.size, y.size)) if dense else None
+    energy = energy_scale = 0.0
+    for kind in problem.stencils(ratios, loaded):
+        found = _derivatives(kind.energy, y[kind.nodes], kind.params)
+        (energies, gradients), hessians = jax.tree.map(np.asarray, found)
+        energy, energy_scale = energy + energies.sum(), energy_scale + np.abs(energies).sum()
+        np.add.at(gradient, kind.nodes, gradients)
+        np.add.at(scale, kind.nodes, np.abs(gradients))
+        unknowns = (d * kind.nodes[..., None] + np.arange(d)).reshape(len(kind.nodes), -1)
+        hessians = hessians.reshape(-1, *unknowns.shape[1:] * 2)
+        np.add.at(diagonal, unknowns, np.diagonal(hessians, axis1=1, axis2=2))
+        if dense:
+            np.add.at(hessian, (unknowns[:, :, None], unknowns[:, None, :]), hessians)
+    least, bounds, heights, cancelled = _shape(problem, y)
+    gradient = gradient.ravel()[free]
+    return Facts(
+        energy=float(energy),
+        energy_scale=float(energy_scale),
+        cancelled=cancelled,
+        unbalanced=float(np.abs(gradient).max()),
+        gradient=gradient,
+        scale=float(scale.ravel()[free].max()),
+        scale_sum=float(scale.sum()),
+        hessian=hessian[np.ix_(free, free)] if dense else None,
+        stiffest=float(np.abs(diagonal[free]).max()),
+        volumes=least,
+        bounds=bounds,
+        heights=heights,
+    )
+
+
+def _shape(problem: Problem, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Least `J` of elements, bounds under it, their heights, and the round-off of an energy in `F`."""
+    elements, (mu, lam) = np.asarray(problem.elements), problem.lame
+    corners, rest = y[elements], problem.rest[elements]
+    if problem.is_rod:
+        each = lambda value: np.full(len(elements), float(value))
+        least = bounds = np.asarray(_fibres(corners, rest, each(problem.radian), each(problem.height)))
+        areas = np.linalg.norm(rest[:, 1, :2] - rest[:, 0, :2], axis=1) * problem.height
+        heights = np.minimum(areas / problem.height, problem.height)
+    else:
+        least, bounds = volumes(corners, rest)
+        areas = determinants(rest, np.full((1, 3), 1 / 3))[:, 0]
+        straight = rest[:, :3] - np.roll(rest[:, :3], 1, axis=1)
+        heights = areas / np.linalg.norm(straight, axis=2).max(axis=1)
+    return least, bounds, heights, 16 * EPS * float(np.sum((2 * mu + np.abs(lam)) * areas * (1 + np.abs(least))))
+
+
+def command_forces(problem: Problem, ratios: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Derivative `(f, m)` of the gradient over the `f` free coordinates in the commands."""
+    y, columns = problem.relative(x), []
+    for kind in problem.stencils(ratios)[len(problem.bodies) :]:
+        for nodes, change in zip(kind.nodes, np.asarray(_by_command(y[kind.nodes], kind.params)), strict=True):
+            column = np.zeros(y.shape)
+            np.add.at(column, nodes, change)
+            columns.append(column.ravel())
+    return np.stack(columns, axis=1)[~np.asarray(problem.fixed).ravel()]
