@@ -505,3 +505,74 @@ def test_sweep_in_forward_mode():
     expected = np.eye(3)[:, :, None] * np.array([0.5, -0.5])
     expected[1, 1] = np.nan
     np.testing.assert_allclose(across, expected, rtol=1e-12, atol=1e-12)
+
+
+# ------------------------------------------------- every solver, every order, every transformation
+
+SMALL = jb.tendon_beam(3, 2)
+BENT = np.array([0.8, 1.0])
+
+
+def tip(scene, x):
+    return jb.tip_angle(scene, x)
+
+
+# Each is the tip angle at a command, by another solver or inside another transformation. `ramp` and `sweep` run the
+# body of a scan, and JAX partially evaluates that when it is differentiated in reverse.
+SOLVED = {
+    "equilibrium": lambda r: tip(SMALL, jb.equilibrium(jb.command(SMALL, r), solver=TIGHT).x),
+    "ramp": lambda r: tip(SMALL, jb.ramp(SMALL, r, 3, TIGHT).x[-1]),
+    "sweep": lambda r: tip(SMALL, jb.sweep(SMALL, jnp.stack([r, 1.1 * r]), TIGHT).x[0]),
+    "map": lambda r: jax.lax.map(SOLVED["equilibrium"], jnp.stack([r, 0.9 * r]))[0],
+    "scan": lambda r: jax.lax.scan(lambda sum, q: (sum + SOLVED["equilibrium"](q), None), 0.0, r[None])[0],
+    "checkpoint": lambda r: jax.checkpoint(SOLVED["equilibrium"])(r),
+    "vmap": lambda r: jax.vmap(SOLVED["equilibrium"])(jnp.stack([r, 0.9 * r]))[0],
+    "checkpointed map": lambda r: jax.lax.map(jax.checkpoint(SOLVED["equilibrium"]), r[None])[0],
+    "map of ramps": lambda r: jax.lax.map(SOLVED["ramp"], r[None])[0],
+    "vmap of ramps": lambda r: jax.vmap(SOLVED["ramp"])(r[None])[0],
+}
+MODES = {"f": jax.jacfwd, "r": jax.jacrev}
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """Derivatives of the tip angle to third order: the first is implicit, the others are differences of it."""
+    slope = jit(jax.grad(SOLVED["equilibrium"]))
+    at = lambda u: differences(lambda t: slope(jnp.asarray(BENT + t * u)), 0.01)
+    second = np.stack([at(u) for u in np.eye(2)])
+    # Second differences of the slope, along both axes and the diagonal.
+    bend = lambda u: (
+        sum(
+            w * np.asarray(slope(jnp.asarray(BENT + 0.01 * k * u)))
+            for k, w in ((-3, 2), (-2, -27), (-1, 270), (0, -490), (1, 270), (2, -27), (3, 2))
+        )
+        / (180 * 0.01**2)
+    )
+    x, y, both = (bend(np.array(u)) for u in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)))
+    mixed = (both - x - y) / 2
+    return {1: np.asarray(slope(jnp.asarray(BENT))), 2: second, 3: np.array([[x, mixed], [mixed, y]])}
+
+
+FAST = [("ramp", "frr"), ("sweep", "fr"), ("checkpointed map", "rr")]
+ALL = [(solver, modes) for solver in SOLVED for modes in ("ff", "fr", "rf", "rr", "frr", "rrr", "fff")]
+
+
+@pytest.mark.parametrize(
+    ("solver", "modes"), [*FAST, *(pytest.param(*each, marks=pytest.mark.slow) for each in ALL if each not in FAST)]
+)
+def test_derivatives_of_every_solver(expected, solver, modes):
+    f = SOLVED[solver]
+    for mode in modes[::-1]:
+        f = MODES[mode](f)
+    truth = expected[len(modes)]
+    np.testing.assert_allclose(jit(f)(jnp.asarray(BENT)), truth, rtol=0, atol=SECOND * np.abs(truth).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [jb.rod_beam(3), jb.rod_beam(3, density=jb.neo_hookean)], ids=["rod", "logarithmic"])
+def test_second_derivatives_of_a_ramped_rod(scene):
+    """The fibres of a rod are implicit functions too."""
+    one = jax.hessian(lambda r: tip(scene, jb.equilibrium(jb.command(scene, r), solver=TIGHT).x))
+    ramped = jax.hessian(lambda r: tip(scene, jb.ramp(scene, r, 3, TIGHT).x[-1]))
+    truth = jit(one)(jnp.asarray(BENT))
+    np.testing.assert_allclose(jit(ramped)(jnp.asarray(BENT)), truth, rtol=0, atol=1e-9 * np.abs(truth).max())

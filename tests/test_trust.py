@@ -1,0 +1,122 @@
+"""Answers that must not be called OK: what hides an unbalanced force, where the body lies, limits of stability."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+
+NX, NY = 9, 5
+
+
+def beam_of(mesh, lines, moduli, *loads):
+    return jb.Scene(
+        mesh,
+        (jb.solid(mesh, jb.lame(1e4, 0.45)), jb.tendons(mesh, lines, moduli), *loads),
+        jb.clamped(mesh, np.arange(NY)),
+        np.arange((NX - 1) * NY, NX * NY),
+    )
+
+
+def plain(dtype=None, shift=0.0, height=0.8):
+    mesh = jb.rectangle(3.5, height, NX, NY, dtype=dtype)
+    if shift:
+        mesh = jb.Mesh(mesh.nodes + jnp.asarray(shift, mesh.nodes.dtype), mesh.elements)
+    return beam_of(mesh, [[4, 24], [0, 20]], 2e3)
+
+
+@pytest.fixture(scope="module")
+def honest():
+    scene = jb.command(plain(), [0.5, 1.0])
+    return jb.check(jb.equilibrium(scene)).x
+
+
+# ------------------------------------------------------------------------------- what the forces are compared with
+
+
+def test_forces_on_clamped_nodes_excuse_nothing(honest):
+    """A tendon of modulus 1e12 between two clamped nodes, and a load of 1e13 on one, change no answer."""
+    mesh = plain().mesh
+    between = jb.command(beam_of(mesh, [[4, 24], [0, 20], [0, 4]], [2e3, 2e3, 1e12]), [0.5, 1.0, 0.5])
+    loaded = jb.command(beam_of(mesh, [[4, 24], [0, 20]], 2e3, jb.dead_load(mesh, [2], [1e13, 0.0])), [0.5, 1.0])
+    for scene in (between, loaded):
+        found = jb.check(jb.equilibrium(scene))
+        np.testing.assert_allclose(found.x, honest, atol=1e-10)
+
+
+def test_the_round_off_of_a_stiff_tendon_excuses_no_other_node():
+    """A tendon of modulus 1e12 at the tip: forces elsewhere balance to the tolerance, relative to what acts there."""
+    mesh = plain().mesh
+    scene = jb.command(beam_of(mesh, [[4, 24], [0, 20], [40, 44]], [2e3, 2e3, 1e12]), [0.5, 1.0, 0.999])
+    found = jb.check(jb.equilibrium(scene))
+    elsewhere = slice(NY, (NX - 1) * NY)
+    unbalanced = np.abs(np.asarray(jb.forces(scene, found.x)))[elsewhere]
+    assert unbalanced.max() <= 1e-9 * float(np.abs(jb.tendon_tensions(scene, found.x)[0]))
+
+
+# ------------------------------------------------------------------------------------------ where the body lies
+
+
+@pytest.mark.parametrize(("dtype", "near", "far"), [(jnp.float32, 10.0, 4e3), (jnp.float64, 1e6, 1e12)])
+@pytest.mark.parametrize("height", [0.8, 0.2])
+def test_a_mesh_far_from_the_origin(dtype, near, far, height):
+    """An answer is right to about a thousandth of the body, as its correction says, or it is INACCURATE."""
+    for shift in (near, far):
+        scene = plain(dtype, shift, height)
+        # The same body about the origin: taking the shift from its rounded nodes is exact.
+        centred = jb.Mesh(np.asarray(scene.mesh.nodes, float) - shift, scene.mesh.elements)
+        centred = beam_of(centred, [[4, 24], [0, 20]], 2e3)
+        for ratios in ([0.5, 1.0], [1.0, 0.6], [0.9, 1.0]):
+            found = jb.equilibrium(jb.command(scene, ratios))
+            truth = jb.check(jb.equilibrium(jb.command(centred, ratios)))
+            off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max() / 3.5
+            if shift == near:
+                assert int(found.status) == 0
+            assert int(found.status) == jb.Status.INACCURATE or off < 2e-3
+
+
+# ------------------------------------------------------------------------------------------ limits of stability
+
+
+@pytest.fixture(scope="module")
+def fork(mirrored):
+    """The bifurcation of the straight branch of the mirrored beam, at ratio 0.38258."""
+    s = (1 - 0.3826) / 0.6
+    near = jb.equilibrium(jb.command(mirrored, [0.3826, 0.3826]))
+    branch = jb.trace_branch(mirrored, [0.4, 0.4], x0=near.x, parameter=s, interval=(s - 0.01, s + 0.01), step=0.01)
+    (critical,) = branch.critical
+    assert critical.ratios[0] == pytest.approx(0.38258363, abs=1e-7)
+    return critical
+
+
+def test_a_critical_state_is_inaccurate(mirrored, fork):
+    """The stiffness there is singular to round-off: no derivative, however well the forces balance."""
+    scene = jb.command(mirrored, fork.ratios)
+    found = jb.equilibrium(scene, fork.x)
+    assert float(found.residual) <= 1e-10
+    assert int(found.status) == jb.Status.INACCURATE
+
+
+@pytest.mark.parametrize("aside", [1e-6, 1e-8, -1e-8, -1e-6])
+def test_beside_a_bifurcation(mirrored, fork, aside):
+    """Above it the straight state is found, below it one of the bent pair, each in few steps."""
+    scene = jb.command(mirrored, fork.ratios + aside)
+    found = jb.check(jb.equilibrium(scene))
+    assert int(found.steps) <= 60
+    angle = float(jb.tip_angle(mirrored, found.x))
+    if aside > 0:
+        assert abs(angle) < 1e-6
+    else:
+        assert abs(abs(angle) - 1.078) < 0.01
+    assert float(jb.lowest_mode(scene, found.x).values[0]) > 0
+
+
+def test_a_slope_beside_a_bifurcation_keeps_its_symmetry(mirrored, fork):
+    """Pulling both tendons by the same does not turn the straight beam, though its stiffness is next to singular."""
+    ratio = float(fork.ratios[0]) + 1e-8
+    angle = lambda r: jb.tip_angle(mirrored, jb.equilibrium(jb.command(mirrored, jnp.stack([r, r])), fork.x).x)
+    one_sided = jax.grad(lambda r: jb.tip_angle(mirrored, jb.equilibrium(jb.command(mirrored, r), fork.x).x))
+    scale = float(jnp.abs(one_sided(jnp.array([ratio, ratio]))).max())
+    assert scale > 1e7
+    assert abs(float(jax.grad(angle)(jnp.asarray(ratio)))) < 1e-6 * scale
