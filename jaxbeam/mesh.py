@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, to_device
-from jaxbeam.elements import EDGES, shape_functions, shape_slopes
+from jaxbeam.bernstein import minimiser, value
+from jaxbeam.elements import EDGES, corner_slopes, determinants, is_affine, shape_functions
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
 
@@ -367,11 +368,6 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         )
     a, b, c = nodes[elements[:, 0]], nodes[elements[:, 1]], nodes[elements[:, 2]]
     area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    if elements.shape[1] == 6 and (area > 0).all():
-        # Where edges are curved the triangle must not fold over at any of its nodes.
-        slopes = shape_slopes(6, _PLACES)
-        map_ = np.einsum("tkd,qki->tqdi", nodes[elements], slopes)
-        area = 0.5 * np.linalg.det(map_).min(axis=1)
     bad = np.flatnonzero(area <= 1e-14 * extent**2)
     if bad.size:
         k = bad[0]
@@ -379,4 +375,24 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         raise ValueError(
             f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
             f" ({bad.size} such triangles)"
+        )
+    if not is_affine(elements.shape[1]):
+        _check_curves(nodes, elements, area)
+
+
+def _check_curves(nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
+    """Refuse triangles of six nodes that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
+    slopes = corner_slopes(np.moveaxis(nodes[elements], 0, -1))
+    stretch = np.stack(determinants(slopes, slopes)) / (2 * area)
+    place = minimiser(stretch)
+    least = value(stretch, place)
+    bad = np.flatnonzero(least <= 1e-12)
+    if bad.size:
+        k = bad[0]
+        where = ", ".join(f"{coordinate:.3g}" for coordinate in place[:, k])
+        raise ValueError(
+            f"elements: triangle {k}, {elements[k].tolist()}, folds over: its edges are curved so much that the "
+            f"determinant of its map is {least[k]:.3g} times that of the straight triangle at barycentric coordinates "
+            f"({where}), expected positive; move its nodes 3 to 5 towards the middles of its edges ({bad.size} such "
+            f"triangles)"
         )

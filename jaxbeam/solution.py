@@ -57,7 +57,7 @@ class Solution:
     projected: `()` how many of them used projected Hessians.
     halvings: `()` line-search halvings in all.
     attempts: `()` Newton solves; more than 1 when a first one failed or ended on a saddle.
-    smallest_jacobian: `()` smallest `J = det F` over the solids; infinite without one.
+    smallest_jacobian: `()` smallest `J = det F` anywhere in the solids; infinite without one.
     worst_element: `()` the element where it is.
     ratios: `(m,)` commanded ratio of each tendon.
     reached: `()` how far `x` got: 1 at the command itself; less where the way to it broke off, and then `x`
