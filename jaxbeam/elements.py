@@ -9,6 +9,8 @@ Strang and Fix (1973) and Dunavant, Int. J. Numer. Methods Eng. 21 (1985), 1129-
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 # The corners that each node between corners lies between.
@@ -76,3 +78,32 @@ def shape_slopes(nodes: int, points: np.ndarray) -> np.ndarray:
     for k, (a, b) in enumerate(EDGES if nodes == 6 else ()):
         by_l[:, 3 + k, a], by_l[:, 3 + k, b] = 4 * points[:, b], 4 * points[:, a]
     return by_l[:, :, 1:] - by_l[:, :, :1]
+
+
+# --------------------------------------------------------------------------- how the map of an element stretches area
+
+
+def is_affine(nodes: int) -> bool:
+    """Whether the map from the reference triangle to such an element has the same slopes, and so `J`, everywhere."""
+    return nodes == 3
+
+
+def corner_slopes(x: Any) -> list[list[Any]]:
+    """Derivatives `(2, ...)` in `l1` and `l2`, at each corner, of the map with six nodes at `x` `(6, 2, ...)`.
+
+    In between they are linear in the barycentric coordinates.
+    """
+    slopes = shape_slopes(6, np.eye(3))
+    # Python's own numbers leave the dtype of the positions as it is.
+    sums = lambda factors: sum(f * x[k] for k, f in enumerate(factors.tolist()) if f)
+    return [[sums(slopes[c, :, d]) for d in range(2)] for c in range(3)]
+
+
+def determinants(left: list[list[Any]], right: list[list[Any]]) -> list[Any]:
+    """Bernstein coefficients (see `jaxbeam.bernstein`) of the determinant of two slopes from `corner_slopes`.
+
+    They are the first slope of one map and the second of another. If both maps are the same, it tells by how much
+    that map stretches area: its mean is twice the area of the element.
+    """
+    crossed = lambda a, b: left[a][0][0] * right[b][1][1] - left[a][0][1] * right[b][1][0]
+    return [crossed(a, a) for a in range(3)] + [(crossed(a, b) + crossed(b, a)) / 2 for a, b in EDGES]

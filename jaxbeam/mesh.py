@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxbeam import checks
 from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, to_device
-from jaxbeam.elements import EDGES, shape_functions, shape_slopes
+from jaxbeam.bernstein import minimiser, value
+from jaxbeam.elements import EDGES, corner_slopes, determinants, is_affine, shape_functions
 
 Diagonals = Literal["one-sided", "mirrored", "crossed"]
 
@@ -373,19 +374,32 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
             f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
             f" ({bad.size} such triangles)"
         )
+    if not is_affine(elements.shape[1]):
+        _check_curves(nodes, elements, area)
 
 
 def _areas(nodes: Any, elements: np.ndarray) -> Any:
-    """Signed area `(t,)` of each triangle; of one with curved edges, the least that it has at any of its nodes."""
-    xp = namespace(nodes)
+    """Signed area `(t,)` of each triangle between its corners."""
     a, b, c = (nodes[elements[:, k]] for k in range(3))
-    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    if elements.shape[1] == 3:
-        return area
-    slopes = shape_slopes(6, _PLACES).astype(nodes.dtype)
-    map_ = xp.einsum("tkd,qki->tqdi", nodes[elements], slopes)
-    determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
-    return xp.minimum(area, 0.5 * xp.min(determinant, axis=1))
+    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+def _check_curves(nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
+    """Refuse triangles of six nodes that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
+    slopes = corner_slopes(np.moveaxis(nodes[elements], 0, -1))
+    stretch = np.stack(determinants(slopes, slopes)) / (2 * area)
+    place = minimiser(stretch)
+    least = value(stretch, place)
+    bad = np.flatnonzero(least <= 1e-12)
+    if bad.size:
+        k = bad[0]
+        where = ", ".join(f"{coordinate:.3g}" for coordinate in place[:, k])
+        raise ValueError(
+            f"elements: triangle {k}, {elements[k].tolist()}, folds over: its edges are curved so much that the "
+            f"determinant of its map is {least[k]:.3g} times that of the straight triangle at barycentric coordinates "
+            f"({where}), expected positive; move its nodes 3 to 5 towards the middles of its edges ({bad.size} such "
+            f"triangles)"
+        )
 
 
 # ----------------------------------------------------------------------------------------------- overlaps

@@ -21,7 +21,7 @@ from jaxbeam.anchors import surface_of
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, middle_column, rectangle, with_middles
 from jaxbeam.rod import Line, RodEnergy, at_offsets, fibre_stretches, rod, rod_tendons, straight
-from jaxbeam.stencils import admissible_step, stencil_gradients, stencil_hessian, volume_ratios
+from jaxbeam.stencils import admissible_step, rest_is_sound, smallest_ratios, stencil_gradients, stencil_hessian
 from jaxbeam.terms import (
     SolidEnergy,
     TendonEnergy,
@@ -290,7 +290,7 @@ def is_valid(scene: Scene) -> jax.Array:
         if isinstance(term.energy, RodEnergy):
             valid &= jnp.all((term.params.height > 0) & (term.params.radian > 0))
         if isinstance(term.energy, SolidEnergy):
-            valid &= jnp.all(term.params.weights > 0)
+            valid &= jnp.all(rest_is_sound(term.params))
         bodily = isinstance(term.energy, SolidEnergy | RodEnergy)
         if bodily and isinstance(material := term.params.material, Lame):
             # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
@@ -376,14 +376,15 @@ def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[j
 
 
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
-    """Smallest `J = det F` `()` over the solids at `x`, or stretch of a fibre of the rods; infinite without any."""
+    """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods; infinite if there are
+    neither. It is not only looked for at quadrature points."""
     return worst_element(scene, placed(scene, x))[0]
 
 
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The smallest `J` `()` over the solids, or stretch of a fibre of the rods, and the number `()` of its element (-1
-    in a scene without either)."""
-    ratios = [jnp.min(volume_ratios(x[t.nodes], t.params), axis=0) for t in solid_terms(scene)]
+    """The smallest `J` `()` anywhere in the solids, or stretch of a fibre of the rods, and the number `()` of its
+    element (-1 in a scene without either)."""
+    ratios = [smallest_ratios(x[t.nodes], t.params) for t in solid_terms(scene)]
     ratios += [jnp.min(jax.vmap(fibre_stretches)(x[t.nodes], t.params), axis=1) for t in rod_terms(scene)]
     if not ratios:
         return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
@@ -393,19 +394,21 @@ def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 # An element under this `J` is let through zero, where its energy allows that: held back, it would be approached
-# in ever smaller steps. It may well come back, and if it does not, the solution says so.
+# in ever smaller steps. It may well come back, and if it does not, the solution says so. Away from the quadrature
+# points every energy allows it.
 RELEASED = 0.1
 
 
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
     """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
 
-    An element of a density that forbids inversion always does; one of another only while it is not under
+    The quadrature points of a density that forbids inversion always do; all else only while it is not under
     `RELEASED`.
     """
     limits = [jnp.asarray(jnp.inf, x.dtype)]
     for term in solid_terms(scene):
         assert isinstance(term.energy, SolidEnergy)
         bound = 0.0 if forbids_inversion(term.energy, term.params) else RELEASED
-        limits.append(jnp.min(admissible_step(x[term.nodes], dx[term.nodes], term.params, keep, bound)))
+        steps = admissible_step(x[term.nodes], dx[term.nodes], term.params, keep, bound, RELEASED)
+        limits.append(jnp.min(steps))
     return jnp.min(jnp.stack(limits))

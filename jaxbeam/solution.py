@@ -61,7 +61,7 @@ class Solution:
     projected: `()` how many of them used projected Hessians.
     halvings: `()` line-search halvings in all.
     attempts: `()` Newton solves; more than 1 when a first one failed or ended on a saddle.
-    smallest_jacobian: `()` smallest `J = det F` over the solids; infinite without one.
+    smallest_jacobian: `()` smallest `J = det F` anywhere in the solids; infinite without one.
     worst_element: `()` the element where it is.
     crossing: `(2, 2)` int32, two edges of the surface that cross, each by the numbers of its end nodes; -1 if none do.
     ratios: `(m,)` commanded ratio of each tendon.

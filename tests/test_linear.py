@@ -86,6 +86,41 @@ def test_projection_is_idempotent_and_leaves_definite_alone(projected):
     np.testing.assert_allclose(norms(opposite) / norms(definite), 0, atol=100 * EPS)
 
 
+def with_eigenvalues(*values):
+    """Matrices with these eigenvalues, turned at random."""
+    turns = np.linalg.qr(np.random.default_rng(2).normal(size=(200, 4, 4)))[0]
+    matrices = (turns * np.array(values)) @ np.swapaxes(turns, 1, 2)
+    return 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
+
+
+def random_symmetric():
+    matrices = np.random.default_rng(0).normal(size=(200, 4, 4))
+    return matrices + np.swapaxes(matrices, 1, 2)
+
+
+GRADES = np.geomspace(1.0, 1e-8, 4)
+
+
+@pytest.mark.parametrize(
+    "matrices",
+    [
+        random_symmetric(),
+        GRADES[:, None] * random_symmetric() * GRADES,
+        with_eigenvalues(1.0, 1.0, -1.0, -1.0),
+        with_eigenvalues(2.0, -1.0, -1.0, -1.0),
+        with_eigenvalues(1.0, 1.0 + 1e-9, -1.0, -1.0 - 1e-9),
+        with_eigenvalues(1e8, 1.0, -1.0, -1e-8),
+        with_eigenvalues(0.0, 0.0, 0.0, -1.0),
+    ],
+    ids=["random", "graded", "two pairs", "a triple", "nearly pairs", "wide", "singular"],
+)
+def test_jacobi_sweeps_reach_round_off(matrices):
+    """As many sweeps as every kind of matrix needs: what is left is the round-off of LAPACK's own projection."""
+    values, vectors = np.linalg.eigh(matrices)
+    expected = (vectors * np.maximum(values, 0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    assert (norms(project_together(jnp.asarray(matrices)) - expected) < 100 * EPS * norms(matrices)).all()
+
+
 # ------------------------------------------------------------------------------------- linear solvers
 
 LONG = jb.rectangle(4.0, 1.0, 9, 3)
