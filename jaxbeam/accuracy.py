@@ -106,7 +106,8 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
     """A measure to a tolerance: from the scene's own mesh to finer ones, until the error bar is below it.
 
     Each mesh starts from what the error estimate of the one before says about it, so that two or three Newton steps are
-    left to take. Begin with a coarse mesh: rungs that suffice are never refined.
+    left to take. Begin with a coarse mesh: rungs that suffice are never refined. A tolerance below the round-off of the
+    value is not met on any mesh, and none is refined for it.
 
     Args:
         scene: a concrete one, with its command.
@@ -127,8 +128,9 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         solution = equilibrium(scene, start, solver)
         estimate, finer, ahead = _estimate(scene, solution, measure, solver)
         met = estimate.bar <= tolerance
-        stuck = bool(solution.status != 0) or np.count_nonzero(~finer.fixed) > most or not np.isfinite(estimate.bar)
-        if met or stuck:
+        stuck = bool(solution.status != 0) or not np.isfinite(estimate.bar)
+        hopeless = tolerance < float(jnp.finfo(solution.x.dtype).eps) * abs(estimate.value)
+        if met or stuck or hopeless or not np.count_nonzero(~finer.fixed) <= most:
             return Answer(estimate.value, estimate, met, rung, scene, solution)
         rung, scene, start = rung + 1, finer, ahead
 

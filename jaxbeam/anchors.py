@@ -63,15 +63,16 @@ def walk(
     """
     for ways in (edges, edges[:, [1, 0, 2][: edges.shape[1]]]):
         following = {line[0]: line for line in ways.tolist()}
-        here, s = node, 0.0
+        here, s, left = node, 0.0, len(ways)
         while s < (1 - 1e-9) * width:
-            if here not in following or (s > 0 and here == node):
+            # Where two parts of a body touch at a node, the way may lead round the other part for ever.
+            if here not in following or (s > 0 and here == node) or left == 0:
                 problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
                 raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
             line = following[here]
             length = float(np.linalg.norm(positions[line[1]] - positions[line[0]]))
             yield line, s, length, min(1.0, (width - s) / length)
-            here, s = line[1], s + length
+            here, s, left = line[1], s + length, left - 1
 
 
 def surface(mesh: Mesh) -> np.ndarray:

@@ -158,7 +158,8 @@ def trace_branch(
         old, new = points[-1], advance(points[-1], jnp.asarray(length, dtype))
         if not float(new.residual) <= solver.tolerance(dtype) or _strays(old, new, length, float(extent(scene))):
             length /= 2
-            if length < 1e-6 * step:
+            # Also where the step is infinite, and half of it as well.
+            if not length > 1e-6 * step:
                 ended = "step"
                 break
             continue

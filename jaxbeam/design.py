@@ -24,7 +24,7 @@ from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
 from jaxbeam.newton import Newton, check_asked, topology
 from jaxbeam.scene import Scene, tendon_count
-from jaxbeam.search import History, Measure, Problem, Stand, search
+from jaxbeam.search import History, Measure, Problem, Stand, effects, search
 from jaxbeam.solution import Solution
 
 
@@ -44,7 +44,8 @@ class Design:
     solution: their equilibrium.
     value: the measure there; for `minimise` the loss.
     loss: `()` distance from the target, Euclidean; for `minimise` the loss.
-    held: `(m,)` -1 where the lower bound holds a command back, 1 where the upper does, else 0.
+    held: `(m,)` -1 where the lower bound holds a command back, 1 where the upper does, else 0: without that bound the
+        answer would be nearer to the target, or as near with less effort.
     solves: `()` equilibria solved.
     history: of all of them.
     status: `()` int32 of a `DesignStatus`.
@@ -95,7 +96,8 @@ def reach(
 
     Returns:
         A `Design` of status `REACHED`, or `UNREACHABLE`: then `value` is the nearest that was found, and `held` says
-        which bounds are in the way, or `NOT_CONVERGED`.
+        which bounds are in the way, or `NOT_CONVERGED`: also where no command has an effect on the measure, at the
+        start and as they are shortened.
 
     Raises:
         ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
@@ -231,16 +233,18 @@ def _reach_each(
 def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:
     """The report of a search."""
     close = jnp.max(jnp.abs(at.miss)) <= problem.tolerance
+    # Without any effect of any command there is no telling what is in reach.
+    known = close | jnp.any(effects(at, jnp.ravel(target)))
     ended = jnp.where(close, DesignStatus.REACHED, DesignStatus.UNREACHABLE)
     return Design(
         theta=at.theta,
         solution=at.solution,
         value=at.miss.reshape(target.shape) + target,
         loss=jnp.linalg.norm(at.miss),
-        held=jnp.where(close, 0, at.held),
+        held=at.held,
         solves=at.solves,
         history=at.history,
-        status=jnp.where(at.resting, ended, DesignStatus.NOT_CONVERGED).astype(jnp.int32),
+        status=jnp.where(at.resting & known, ended, DesignStatus.NOT_CONVERGED).astype(jnp.int32),
     )
 
 

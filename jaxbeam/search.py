@@ -68,6 +68,8 @@ class Stand(NamedTuple):
     step: jax.Array
     held: jax.Array
     radius: jax.Array
+    seen: jax.Array  # (m,) commands of which an effect was seen, or that were shortened as far as they go
+    probing: jax.Array  # the step looks for an effect of those that have none
     solves: jax.Array
     resting: jax.Array
     history: History
@@ -98,7 +100,11 @@ def search(
     solver: Newton,
 ) -> Stand:
     """Sequential quadratic programming from the command `theta + step`, which is approached from `theta`, in
-    equilibrium at `x`."""
+    equilibrium at `x`.
+
+    A command that has no effect, to first or second order, may have one elsewhere: a tendon that is slack, or a measure
+    that is flat. Where the search would end short of the target, such commands are shortened until an effect is seen.
+    """
     goal, dtype, m = jnp.ravel(target), x.dtype, theta.size
     p = goal.size
 
@@ -122,12 +128,17 @@ def search(
         first, new = at.solves == 0, look(at)
         theta, miss = new.theta, new.miss
         good = (new.solution.status == 0) & jnp.all(jnp.isfinite(new.bend)) & jnp.all(jnp.isfinite(new.slope))
+        # Where commands have no effect there is nothing to follow: what they were shortened to is a start like any.
+        first |= at.probing
         # Nearer to the target, or no farther than solves can tell; or cheaper, and not too far from it, which is
         # allowed less and less.
         far, before = jnp.linalg.norm(miss), jnp.linalg.norm(at.miss)
         nearer = far <= before + 0.1 * problem.tolerance
         cheaper = (far <= at.funnel) & (jnp.sum((1 - theta) ** 2) < jnp.sum((1 - at.theta) ** 2))
-        taken = good & (first | nearer | cheaper)
+        # Where all commands had an effect somewhere, one at which none has any is a step too far.
+        lost = jnp.all(at.seen) & jnp.any(effects(at, goal)) & ~jnp.any(effects(new, goal))
+        lost &= jnp.max(jnp.abs(miss)) > problem.tolerance
+        taken = good & (first | nearer | cheaper) & ~lost
         funnel = jnp.where(first, 0.1 * far, jnp.where(taken & ~nearer, 0.5 * at.funnel, at.funnel))
         here = choose(taken, new, at)
         scale = jnp.maximum(at.scale, jnp.where(taken, jnp.sum(new.slope**2), 0))
@@ -136,14 +147,21 @@ def search(
         entry = History(theta, far, new.solution.status)
         near = jnp.max(jnp.abs(here.miss)) <= problem.tolerance
         still = jnp.max(jnp.abs(here.slope @ step)) <= 0.5 * problem.tolerance
+        rest = (jnp.max(jnp.abs(step)) <= REST) & (radius > 10 * REST) & (near | still)
+        room = here.theta - problem.low
+        seen = at.seen | (taken & effects(here, goal)) | (room <= REST)
+        probing = (rest | at.probing) & ~near & jnp.any(~seen)
+        step = jnp.where(probing, jnp.where(seen, 0, -jnp.minimum(room, radius)), step)
         return here._replace(
             funnel=funnel,
             scale=scale,
             step=step,
             held=held,
             radius=radius,
+            seen=seen,
+            probing=probing,
             solves=at.solves + 1,
-            resting=(jnp.max(jnp.abs(step)) <= REST) & (radius > 10 * REST) & (near | still),
+            resting=rest & ~probing,
             history=jax.tree.map(lambda all, one: all.at[at.solves].set(one), at.history, entry),
         )
 
@@ -163,6 +181,8 @@ def search(
         step=step,
         held=jnp.zeros(m, jnp.int32),
         radius=jnp.asarray(RADIUS, dtype),
+        seen=jnp.zeros(m, bool),
+        probing=jnp.asarray(False),
         solves=jnp.zeros((), jnp.int32),
         resting=jnp.asarray(False),
         history=History(
@@ -178,6 +198,13 @@ def search(
         & ((at.solves == 0) | jnp.all(jnp.isfinite(at.miss)))
     )
     return lax.while_loop(going, body, begin)
+
+
+def effects(at: Stand, goal: jax.Array) -> jax.Array:
+    """Which commands `(m,)` have an effect on the measure, to first or second order: more than its round-off."""
+    round_off = jnp.finfo(at.theta.dtype).eps * (jnp.abs(goal) + jnp.abs(at.miss))
+    bends = jnp.max(jnp.abs(at.bend), axis=2)
+    return jnp.any(jnp.maximum(jnp.abs(at.slope), bends) > round_off[:, None], axis=0)
 
 
 def _program(at: Stand, problem: Problem, scale: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -150,6 +150,15 @@ def test_patch_goes_round_corners_and_refuses_what_has_none():
         jb.tendon_beam(5, 3, anchor_width=-1.0)
 
 
+def test_patch_of_two_triangles_that_touch_at_a_node():
+    """The surface leads from the one round and round the other."""
+    nodes = np.array([[0.0, 0.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0], [2.0, 1.0]])
+    mesh = jb.Mesh(nodes, [[0, 1, 2], [0, 3, 4]])
+    for node in (1, 3):
+        with pytest.raises(ValueError, match="shorter than the width"):
+            patch(mesh, node, 1e3)
+
+
 def test_no_width_is_a_point():
     """As it was: a term of two nodes, without weights."""
     term = jb.tendon_beam(5, 3).terms[1]
@@ -210,6 +219,13 @@ def test_solve_to_climbs_as_far_as_it_must(coarse):
     assert int(hard.solution.steps) <= 4 < int(coarse[1].steps)
     never = jb.solve_to(scene, jb.tip_angle, 1e-9, most=100)
     assert not never.met and never.rung == 0 and never.estimate.bar > 1e-9
+
+
+def test_no_mesh_is_refined_for_a_tolerance_below_round_off(coarse):
+    scene, _ = coarse
+    for tolerance in (1e-300, 1e-15):
+        never = jb.solve_to(scene, jb.tip_angle, tolerance)
+        assert not never.met and never.rung == 0 and never.scene is scene
 
 
 def test_nothing_is_certified_that_has_no_limit(coarse):

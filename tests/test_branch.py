@@ -1,5 +1,7 @@
 """Branches of the reference beam through folds and bifurcations, checked by means that know nothing of arclength."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -273,6 +275,14 @@ def test_errors(beam):
         jb.trace_branch(beam, [0.3])
     with pytest.raises(ValueError, match="ratios: expected positive finite numbers"):
         jb.trace_branch(beam, [0.3, -1.0])
+
+
+def test_a_step_without_end_is_broken_off():
+    """It is halved no more often than another: half of infinity is no shorter. Or it is refused."""
+    scene = spring_pair(0.9)
+    with contextlib.suppress(ValueError):
+        branch = jb.trace_branch(scene, [0.8, 0.8], parameter=0.5, step=np.inf)
+        assert branch.ended == "step" and len(branch.x) == 1
 
 
 def test_no_equilibrium_at_the_start():

@@ -1,5 +1,7 @@
 """Inverse design: targets that are hit, targets that cannot be, the least effort, and any loss by any optimiser."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 from helpers import small_beam
 
 import jaxbeam as jb
+from jaxbeam._tree import replace
+from jaxbeam.terms import TendonEnergy
 
 REACHED, UNREACHABLE, NOT_CONVERGED = jb.DesignStatus
 
@@ -137,6 +141,105 @@ def test_path_of_targets(beam):
     assert np.asarray(found.solves)[1:].max() <= 4
     assert np.asarray(found.solution.steps)[1:].mean() < 6  # of Newton, in the last of these solves
     np.testing.assert_allclose(jb.reach(beam, targets[7], jb.tip_position).theta, found.theta[7], rtol=0, atol=1e-7)
+
+
+# -------------------------------------------------------------------------------------- bounds that hold
+
+
+@pytest.fixture(scope="module")
+def small():
+    return small_beam()
+
+
+@pytest.mark.parametrize(
+    ("target", "bounds", "held"),
+    [
+        (8.0, (0.4, 1.0), [0, 1]),
+        (-8.0, (0.4, 1.0), [1, 0]),
+        (8.0, (0.4, 1.6), [0, 0]),
+        (4.0, ([0.85, 0.4], [1.0, 1.6]), [-1, 0]),
+        (8.0, ([0.4, 1.2], 1.6), [0, -1]),
+        (0.0, (0.4, 1.0), [0, 0]),
+    ],
+)
+def test_bounds_that_hold_where_a_target_is_reached(small, target, bounds, held):
+    """By Lagrange's condition: with the price that balances the effort of the free commands, each command that is held
+    would be moved out of its bounds. Commands at rest are at the bound of 1, and it does not hold them."""
+    found = jb.reach(small, target, bounds=bounds)
+    assert int(found.status) == REACHED
+    np.testing.assert_array_equal(found.held, held)
+
+    def angle(theta):
+        scene = jb.command(small, theta)
+        return jb.tip_angle(scene, jb.equilibrium(scene).x)
+
+    slope, short = np.asarray(jax.jit(jax.grad(angle))(found.theta)), 1 - np.asarray(found.theta)
+    free = np.asarray(held) == 0
+    price = short[free] @ slope[free] / (slope[free] @ slope[free])
+    pull = short - price * slope
+    np.testing.assert_allclose(pull[free], 0, atol=1e-6)
+    np.testing.assert_array_equal(np.sign(pull[~free]), np.asarray(held)[~free])
+
+
+@pytest.mark.parametrize("target", [2.0, 5.0, 8.0, 20.0])
+def test_curvature_saves_solves(small, target):
+    """Where no bound holds, both commands are weighed: quadratic convergence needs the measure's own curvature."""
+    found = jb.reach(small, target, bounds=(0.4, 1.6))
+    assert int(found.status) == REACHED and not np.asarray(found.held).any()
+    assert int(found.solves) <= 8
+
+
+# ------------------------------------------------------------------------------- where commands do nothing
+
+
+@dataclasses.dataclass(frozen=True)
+class PullOnly(TendonEnergy):
+    """A thread: slack, and without energy, where it is longer than its ends are apart."""
+
+    def __call__(self, x, params):
+        stretch = self.length(x, params) - params.commanded
+        return 0.5 * params.modulus * jnp.where(stretch > 0, stretch, 0) ** 2
+
+
+def threaded(slack):
+    """The small beam with threads that pull below the ratio `1 / slack`."""
+    beam = jb.tendon_beam(5, 3)
+    body, pulls = beam.terms
+    longer = replace(pulls.params, natural=slack * pulls.params.natural, commanded=slack * pulls.params.commanded)
+    threads = jb.Term(PullOnly(jb.constant_stiffness), pulls.nodes, longer)
+    return jb.Scene(beam.mesh, (body, threads), beam.fixed, beam.tip)
+
+
+@pytest.mark.parametrize(("slack", "target"), [(1.0, 4.0), (1.2, 4.0), (1.2, -4.0)])
+def test_slack_tendons_are_shortened_until_they_pull(slack, target):
+    """At rest the angle has no slope and no curvature, and that says nothing of what is in reach."""
+    scene = threaded(slack)
+    found = jb.reach(scene, target)
+    assert int(found.status) == REACHED
+    np.testing.assert_allclose(solved(scene, found.theta), target, atol=2e-8)
+    working = 0 if target > 0 else 1
+    assert float(found.theta[1 - working]) == 1 and float(found.theta[working]) < 1 / slack
+
+
+def over_two_degrees(scene, x):
+    return jnp.maximum(jb.tip_angle(scene, x) - 2, 0)
+
+
+def test_no_slope_is_no_information(small):
+    """A measure that is flat at the start, and stays so when both tendons are shortened alike: nothing is claimed. From
+    where it has a slope the same target is reached, and one out of reach is called so."""
+    found = jb.reach(small, 1.0, over_two_degrees)
+    assert int(found.status) == NOT_CONVERGED
+    assert float(found.history.theta[: int(found.solves)].min()) < 0.41
+    for target, status in ((1.0, REACHED), (60.0, UNREACHABLE)):
+        assert int(jb.reach(small, target, over_two_degrees, starts=[[0.7, 1.0]]).status) == status
+
+
+def test_each_of_several_targets_with_slack_tendons():
+    """One that is no number ends, and harms no other. The last asks for the tendon that is slack where the first ended,
+    where only the other one has an effect."""
+    found = jb.reach_each(threaded(1.2), [4.0, jnp.nan, -4.0])
+    assert np.asarray(found.status).tolist() == [REACHED, NOT_CONVERGED, REACHED]
 
 
 # --------------------------------------------------------------------------------------- least effort
