@@ -36,7 +36,10 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
 
     apart = sides(0) * sides(1) < 0
     joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
-    crossed = (apart & apart.T & ~joined).ravel()
+    # Of segments in one line round-off decides the sides. Those that lie one after the other do not meet.
+    low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
+    near = jnp.all(low[:, None] <= high[None, :], axis=2)
+    crossed = (apart & apart.T & near & near.T & ~joined).ravel()
     first = jnp.argmax(crossed)
     pair = edges[jnp.stack([first // len(points), first % len(points)])]
     return jnp.where(crossed[first], pair, -1)
