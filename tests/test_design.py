@@ -1,6 +1,7 @@
 """Inverse design: targets that are hit, targets that cannot be, the least effort, and any loss by any optimiser."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,7 @@ def test_beyond_the_bounds(beam, grid, target, held):
 def test_beyond_the_peak(beam):
     """With more room the angle has a peak inside the bounds: no bound is in the way of 50 degrees, and none holds."""
     found = jb.reach(beam, 50.0, bounds=(0.2, 1.0))
-    ratios = np.linspace(0.2, 0.4, 81)
+    ratios = np.linspace(0.25, 0.4, 61)  # at 0.2 the beam passes through itself
     angles = [solved(beam, [ratio, 1.0]) for ratio in ratios]
     assert int(found.status) == UNREACHABLE
     np.testing.assert_array_equal(found.held, [0, 1])
@@ -236,9 +237,9 @@ def test_no_slope_is_no_information(small):
 
 
 def test_each_of_several_targets_with_slack_tendons():
-    """One that is no number ends, and harms no other. The last asks for the tendon that is slack where the first ended,
+    """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that is slack where the first ended,
     where only the other one has an effect."""
-    found = jb.reach_each(threaded(1.2), [4.0, jnp.nan, -4.0])
+    found = jax.jit(partial(jb.reach_each, threaded(1.2)))(jnp.array([4.0, jnp.nan, -4.0]))
     assert np.asarray(found.status).tolist() == [REACHED, NOT_CONVERGED, REACHED]
 
 
