@@ -215,7 +215,9 @@ def newton(
         pulls = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(layout, pulls)
         moves = solver.linear.solve(layout, stiffness.factor, pulls)
         moves = jax.vmap(lambda move: expand(layout, -move, x.shape), in_axes=1)(moves)
-        left, softest = jnp.max(jnp.abs(moves[0])) / size, _norm(noise) / _norm(moves[2])
+        left = jnp.max(jnp.abs(moves[0])) / size
+        # Rayleigh quotient of one inverse iteration: near a limit of stability, the lowest eigenvalue.
+        softest = -jnp.sum(noise * moves[2]) / jnp.sum(moves[2] ** 2)
         # In balance, but a step would still move it: rounding the positions is what keeps it from rest along a soft
         # mode, and it rounds anew with each step.
         vague = (residual <= rtol) & (left > INACCURATE) & (state.counts[POLISHED] < POLISH)
@@ -231,7 +233,7 @@ def newton(
             step=moves[0],
             aside=aside + moves[1],
             correction=left,
-            singular=softest <= SINGULAR * float(jnp.finfo(x.dtype).eps) * x.size**0.5 * jnp.max(stiffness.rows),
+            singular=softest <= SINGULAR * float(jnp.finfo(x.dtype).eps) * jnp.max(stiffness.rows),
             residual=residual,
             counts=counts,
             fresh=~yes,
@@ -239,10 +241,6 @@ def newton(
         )
 
     return lax.while_loop(lambda state: state.running, body, first)
-
-
-def _norm(field: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(field**2))
 
 
 def no_factor(layout: Layout, dtype: Any, solver: Newton) -> Any:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-# Sweeps over all pairs of rows. The method converges quadratically: after six, four by four are at round-off.
-SWEEPS = 6
+# Sweeps over all pairs of rows, beyond their number: the method converges quadratically, and larger matrices later.
+# After six, four by four are at round-off.
+SWEEPS = 2
 
 
 def project_each(matrices: jax.Array) -> jax.Array:
@@ -59,6 +60,6 @@ def project_many(matrices: jax.Array) -> jax.Array:
         return rotated(rotated(a).swapaxes(0, 1)), rotated(v)
 
     vectors = jnp.broadcast_to(jnp.eye(s, dtype=matrices.dtype)[:, :, None], matrices.shape)
-    values, vectors = lax.fori_loop(0, SWEEPS * (s - 1), turn, (matrices, vectors))
+    values, vectors = lax.fori_loop(0, (SWEEPS + s) * (s - 1), turn, (matrices, vectors))
     kept = jnp.maximum(jnp.stack([values[i, i] for i in range(s)]), 0)
     return jnp.sum(vectors[:, :, None] * (kept[:, None] * vectors)[:, None], axis=0)

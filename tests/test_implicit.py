@@ -509,7 +509,7 @@ def test_sweep_in_forward_mode():
 
 # ------------------------------------------------- every solver, every order, every transformation
 
-SMALL = jb.tendon_beam(3, 2)
+TINY = jb.tendon_beam(3, 2)
 BENT = np.array([0.8, 1.0])
 
 
@@ -520,9 +520,9 @@ def tip(scene, x):
 # Each is the tip angle at a command, by another solver or inside another transformation. `ramp` and `sweep` run the
 # body of a scan, and JAX partially evaluates that when it is differentiated in reverse.
 SOLVED = {
-    "equilibrium": lambda r: tip(SMALL, jb.equilibrium(jb.command(SMALL, r), solver=TIGHT).x),
-    "ramp": lambda r: tip(SMALL, jb.ramp(SMALL, r, 3, TIGHT).x[-1]),
-    "sweep": lambda r: tip(SMALL, jb.sweep(SMALL, jnp.stack([r, 1.1 * r]), TIGHT).x[0]),
+    "equilibrium": lambda r: tip(TINY, jb.equilibrium(jb.command(TINY, r), solver=TIGHT).x),
+    "ramp": lambda r: tip(TINY, jb.ramp(TINY, r, 3, TIGHT).x[-1]),
+    "sweep": lambda r: tip(TINY, jb.sweep(TINY, jnp.stack([r, 1.1 * r]), TIGHT).x[0]),
     "map": lambda r: jax.lax.map(SOLVED["equilibrium"], jnp.stack([r, 0.9 * r]))[0],
     "scan": lambda r: jax.lax.scan(lambda sum, q: (sum + SOLVED["equilibrium"](q), None), 0.0, r[None])[0],
     "checkpoint": lambda r: jax.checkpoint(SOLVED["equilibrium"])(r),

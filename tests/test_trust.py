@@ -91,11 +91,18 @@ def fork(mirrored):
 
 
 def test_a_critical_state_is_inaccurate(mirrored, fork):
-    """The stiffness there is singular to round-off: no derivative, however well the forces balance."""
+    """The stiffness there is singular to round-off: no derivative, however well the forces balance.
+
+    Rounding decides whether Newton's method stays or drifts along the soft mode. If it drifts, it must arrive at the
+    bent state, whose lowest eigenvalue is 0.16.
+    """
     scene = jb.command(mirrored, fork.ratios)
     found = jb.equilibrium(scene, fork.x)
     assert float(found.residual) <= 1e-10
-    assert int(found.status) == jb.Status.INACCURATE
+    if np.abs(found.x - fork.x).max() < 1e-3:
+        assert int(found.status) == jb.Status.INACCURATE
+    else:
+        assert float(jb.lowest_mode(scene, jb.check(found).x).values[0]) > 0.1
 
 
 @pytest.mark.parametrize("aside", [1e-6, 1e-8, -1e-8, -1e-6])
