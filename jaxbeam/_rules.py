@@ -18,6 +18,8 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jaxbeam._tree import usual_rules
+
 T = TypeVar("T")
 Axes = tuple[tuple[int | None, ...], ...]
 
@@ -61,6 +63,7 @@ class custom_derivative(Generic[T]):
     def _values(self, static: tuple[Any, ...], tree: Any, axes: Axes) -> Callable[..., list[jax.Array]]:
         """The function from leaves to leaves, mapped over each of the batch `axes`."""
 
+        @usual_rules
         def flat(*leaves: jax.Array) -> list[jax.Array]:
             return jax.tree.leaves(self.function(*static, *jax.tree.unflatten(tree, leaves)))
 
@@ -75,6 +78,7 @@ class custom_derivative(Generic[T]):
         moving = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
         count = len(primals)
 
+        @usual_rules
         def both(*leaves: jax.Array) -> list[jax.Array]:
             values, moved = leaves[:count], [_still(leaf) for leaf in leaves[:count]]
             for k, tangent in zip(moving, leaves[count:], strict=True):

@@ -21,7 +21,7 @@ import functools
 import gc
 import inspect
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, ParamSpec, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 # What users may pass for an array: JAX or NumPy arrays, numbers, or (nested) lists of numbers.
 Numbers: TypeAlias = ArrayLike | Sequence[Any]
@@ -56,11 +57,14 @@ class Key:
         self._hash = hash((array.shape, array.dtype.str, array.tobytes()))
         self._device: jax.Array | None = None
 
-    def on_device(self) -> jax.Array:
+    def on_device(self) -> Any:
         """The array as one of JAX's, made once."""
-        if self._device is None:
-            self._device = to_device(self.array)
-        return self._device
+        if self._device is not None:
+            return self._device
+        array = to_device(self.array)
+        if isinstance(array, jax.Array):
+            self._device = array
+        return array
 
     def __hash__(self) -> int:
         return self._hash
@@ -196,7 +200,7 @@ def namespace(*values: Any) -> Any:
     return np if is_concrete(*values) else jnp
 
 
-def to_device(values: Any, dtype: Any = None) -> jax.Array:
+def to_device(values: Any, dtype: Any = None) -> Any:
     """A JAX array of plain numbers, or a JAX array itself, in JAX's dtype for them unless one is given.
 
     `jnp.asarray` would compile a program for each shape it meets.
@@ -204,8 +208,11 @@ def to_device(values: Any, dtype: Any = None) -> jax.Array:
     if isinstance(values, jax.Array):
         return values if dtype in (None, values.dtype) else values.astype(dtype)
     # Inside jit too these are constants, on which checks can run.
+    host = np.asarray(values, dtype)
     with jax.ensure_compile_time_eval():
-        return jax.device_put(np.asarray(values, dtype))
+        array = jax.device_put(host)
+    # In shard_map outside jit it is traced even so, and nothing traced may be kept for later calls.
+    return array if is_concrete(array) else host
 
 
 # What makes XLA compile the solver's many small kernels in less than half the time, and they run no slower: its older
@@ -237,6 +244,25 @@ def _uncollected() -> Iterator[None]:
             gc.enable()
 
 
+def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator: run under JAX's default rules for ranks, dtypes and transfers, whatever the user has set.
+
+    A user who forbids implicit promotion or transfers means their own code. Here arrays of different rank meet by
+    intention, and index arrays of a topology are sent to the device when they are first needed.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: P.args, **named: P.kwargs) -> T:
+        with (
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.transfer_guard("allow"),
+        ):
+            return function(*arguments, **named)
+
+    return call
+
+
 def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Decorator: `jax.jit` with static arguments of these names, for the solver's own entry points.
 
@@ -245,11 +271,18 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
-        inner = jax.jit(function, static_argnames=static)
-        outermost = jax.jit(function, static_argnames=static, compiler_options=COMPILER_OPTIONS)
+
+        @functools.wraps(function)
+        def traced(**values: Any) -> T:
+            _refuse_varying(values)
+            return function(**values)
+
+        inner = jax.jit(traced, static_argnames=static)
+        outermost = jax.jit(traced, static_argnames=static, compiler_options=COMPILER_OPTIONS)
         signature = inspect.signature(function)
 
         @functools.wraps(function)
+        @usual_rules
         def call(*arguments: Any, **named: Any) -> T:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
@@ -262,6 +295,18 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
         return call
 
     return decorate
+
+
+def _refuse_varying(values: Any) -> None:
+    """Refuse values that `jax.shard_map` marks as different on each device, which loops from constants do not take."""
+    for leaf in jax.tree.leaves(values):
+        kind = jax.typeof(leaf) if isinstance(leaf, Tracer) else None
+        # The second is its name from jax 0.10 on.
+        if getattr(kind, "vma", None) or getattr(getattr(kind, "manual_axis_type", None), "varying", None):
+            raise ValueError(
+                "jax.shard_map: the solver's loops start from constants, which its check of varying values refuses; "
+                "call it with check_vma=False, or use sweep, which runs on all devices by itself"
+            )
 
 
 def read_only(values: Any, dtype: Any = None) -> np.ndarray:

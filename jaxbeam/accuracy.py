@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam import checks
-from jaxbeam._tree import compiled, is_concrete, replace, unlock
+from jaxbeam._tree import compiled, is_concrete, replace, unlock, usual_rules
 from jaxbeam.anchors import surface
 from jaxbeam.elements import degree_of
 from jaxbeam.equilibrium import equilibrium
@@ -81,6 +81,7 @@ class Answer(NamedTuple):
     solution: Solution
 
 
+@usual_rules
 def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: Newton = Newton()) -> ErrorEstimate:
     """The error of a measure of a solution, by the dual-weighted residual method on a finer mesh.
 
@@ -102,6 +103,7 @@ def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: N
     return _estimate(scene, solution, measure, solver)[0]
 
 
+@usual_rules
 def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_000, solver: Newton = Newton()) -> Answer:
     """A measure to a tolerance: from the scene's own mesh to finer ones, until the error bar is below it.
 
@@ -135,6 +137,7 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         rung, scene, start = rung + 1, finer, ahead
 
 
+@usual_rules
 def enriched(scene: Scene) -> tuple[Scene, Finer]:
     """The scene on a finer mesh that contains every displacement of its own, and how nodal fields are carried over.
 

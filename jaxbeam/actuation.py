@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, compiled, is_concrete, to_device, unlock
+from jaxbeam._tree import Numbers, compiled, is_concrete, to_device, unlock, usual_rules
 from jaxbeam.equilibrium import differentiable_rows
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
@@ -19,6 +19,7 @@ from jaxbeam.scene import Scene, command
 from jaxbeam.solution import Solution
 
 
+@usual_rules
 def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
     """The commands `(steps, m)` of a ramp: evenly spaced from ratio 1 to `ratios` `(m,)`.
 
@@ -38,6 +39,7 @@ def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
     return to_device((1 - way) + way * end)
 
 
+@usual_rules
 def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
     """Equilibria on the way from ratio 1 to `ratios`, each started from the one before.
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, unlock
+from jaxbeam._tree import Numbers, unlock, usual_rules
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.linear import Layout, assemble, expand, gather
 from jaxbeam.newton import Newton, check_asked, force_round_off, relative_residual, row_magnitudes, topology
@@ -91,6 +91,7 @@ class Point(NamedTuple):
     corrections: jax.Array
 
 
+@usual_rules
 def trace_branch(
     scene: Scene,
     ratios: Numbers,

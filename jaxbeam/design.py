@@ -18,7 +18,7 @@ import optax
 from jax import lax
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace
+from jaxbeam._tree import Numbers, blank, choose, is_concrete, pytree, replace, usual_rules
 from jaxbeam.equilibrium import equilibrium
 from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
@@ -64,6 +64,7 @@ class Design:
 # ------------------------------------------------------------------------------------------------ reach
 
 
+@usual_rules
 def reach(
     scene: Scene,
     target: Numbers,
@@ -110,6 +111,7 @@ def reach(
     return _reach(problem, jnp.asarray(goal, scene.mesh.nodes.dtype), begin, measure, int(max_solves), solver)
 
 
+@usual_rules
 def reach_each(
     scene: Scene,
     targets: Numbers,
@@ -254,6 +256,7 @@ def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:
 MAX_SKIPS = 20
 
 
+@usual_rules
 def minimise(
     loss: Callable[[Scene, jax.Array], jax.Array],
     theta0: Any,

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam._rules import custom_derivative
-from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock
+from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock, usual_rules
 from jaxbeam.dissection import Automatic
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
@@ -40,6 +40,7 @@ from jaxbeam.scene import (
 from jaxbeam.solution import Solution
 
 
+@usual_rules
 def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton()) -> Solution:
     """Node positions at which all forces balance.
 
@@ -72,6 +73,7 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
     return differentiable(open_scene, layout, solution, factor, solver)
 
 
+@usual_rules
 def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Array:
     """Node positions `(n, 2)` by linear elasticity: the solution of one linear system, no more.
 

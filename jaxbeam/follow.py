@@ -238,9 +238,10 @@ def _report(
     flags, up = jnp.array([int(flag) for flag in raised], jnp.int32), jnp.stack(list(raised.values()))
     blame = jnp.where(judging, spent[-1] & (Status.NONFINITE | Status.INVALID), 0)
     status = jnp.sum(jnp.where(up, flags, 0), dtype=jnp.int32) | blame
-    done = jnp.stack([state.counts[STEPS], state.counts[PROJECTED], state.counts[HALVINGS], jnp.where(judging, 0, 1)])
+    own = [state.counts[STEPS], state.counts[PROJECTED], state.counts[HALVINGS], jnp.where(judging, 0, 1)]
+    done = jnp.stack(own, dtype=jnp.int32)
     numbers = jnp.stack([state.at.energy, state.residual, left, volume])
-    return numbers, jnp.concatenate([spent[:4] + done, jnp.stack([element, status])])
+    return numbers, jnp.concatenate([spent[:4] + done, jnp.stack([element, status], dtype=jnp.int32)])
 
 
 def _solutions(path: Report, ratios: jax.Array, crossed: jax.Array, solver: Newton) -> Solution:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam._tree import Numbers, is_concrete, namespace, pytree, to_device
+from jaxbeam._tree import Numbers, is_concrete, namespace, pytree, to_device, usual_rules
 from jaxbeam.checks import POSITIVE, Range, function, numbers, scalar
 
 # Poisson's ratio of a stable material.
@@ -31,6 +31,7 @@ class Lame:
     lam: jax.Array
 
 
+@usual_rules
 def lame(young: Numbers, poisson: Numbers) -> Lame:
     """Lame parameters of linear isotropic elasticity (any textbook, e.g. Bonet and Wood 2008, eq. 6.33).
 
@@ -54,6 +55,7 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
     return Lame(to_device(E / (2 * (1 + nu))), to_device(E * nu / ((1 + nu) * (1 - 2 * nu))))
 
 
+@usual_rules
 def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:
     """Parameters that make `macklin_mueller` behave as (young, poisson) at small strain.
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam._tree import usual_rules
 from jaxbeam.elements import EDGES, degree_of, rule
 from jaxbeam.rod import Line, RodEnergy
 from jaxbeam.scene import Scene, placed, solid_terms, tendon_terms
@@ -21,6 +22,7 @@ from jaxbeam.scene import smallest_jacobian as smallest_jacobian
 from jaxbeam.terms import SolidEnergy, SolidParams, TendonEnergy, Term, displacement_gradients
 
 
+@usual_rules
 def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
     """Deflection of the tip `()` in degrees, `atan2(mean transverse displacement of the tip, length)`.
 
@@ -41,6 +43,7 @@ def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.rad2deg(jnp.arctan2(along[0] * moved[1] - along[1] * moved[0], length))
 
 
+@usual_rules
 def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     """Mean position `(2,)` of the tip nodes.
 
@@ -50,6 +53,7 @@ def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.mean(placed(scene, x)[_tip(scene)][:, :2], axis=0)
 
 
+@usual_rules
 def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     """Rotation of the tip section `()` in degrees, anticlockwise: the rigid turn that fits it best.
 
@@ -71,16 +75,19 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.rad2deg(jnp.arctan2(sine, jnp.sum(before * after)))
 
 
+@usual_rules
 def tendon_lengths(scene: Scene, x: jax.Array) -> jax.Array:
     """Present length of each tendon, `(m,)`."""
     return _over_tendons(scene, x, lambda energy: energy.length)
 
 
+@usual_rules
 def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `dE/dl = k (l - l*)` of each tendon, `(m,)`; positive when it pulls its ends together."""
     return _over_tendons(scene, x, lambda energy: energy.tension)
 
 
+@usual_rules
 def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(t, 2, 2)` in the plane, one for each element of the solid: `P F^T / J`.
 
@@ -90,6 +97,7 @@ def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     return _over_elements(scene, x, _stress)
 
 
+@usual_rules
 def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
 
@@ -112,6 +120,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     return total / jnp.where(area > 0, area, 1)[:, None, None]
 
 
+@usual_rules
 def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
     x = placed(scene, x)
@@ -120,6 +129,7 @@ def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
 
 
+@usual_rules
 def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
     """`J = det F` `(t,)` of each element of the solid, averaged over its quadrature points."""
     return _over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, to_device
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, to_device, usual_rules
 from jaxbeam.bernstein import minimiser, value
 from jaxbeam.elements import EDGES, corner_slopes, determinants, is_affine, shape_functions
 
@@ -59,6 +59,7 @@ class Mesh:
         object.__setattr__(self, "elements", elements)
 
 
+@usual_rules
 def rectangle(
     length: Numbers,
     height: Numbers,
@@ -160,6 +161,7 @@ def middle_column(nx: int, graded: bool) -> int:
     return (nx - 1) // 2
 
 
+@usual_rules
 def quadratic(mesh: Mesh) -> Mesh:
     """The mesh of the same triangles with six nodes each: those between corners follow after the corners.
 
@@ -174,6 +176,7 @@ def quadratic(mesh: Mesh) -> Mesh:
     return _made(mesh, with_middle_nodes(mesh.elements, len(mesh.nodes)))
 
 
+@usual_rules
 def refined(mesh: Mesh) -> Mesh:
     """The mesh with every triangle cut into four by the middles of its edges, four in the place of one.
 

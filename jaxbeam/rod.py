@@ -34,7 +34,7 @@ from jax import lax
 
 from jaxbeam import checks
 from jaxbeam._rules import custom_derivative
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
+from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device, usual_rules
 from jaxbeam.materials import POISSON, check_density, macklin_mueller
 from jaxbeam.mesh import Mesh, float_nodes
 from jaxbeam.terms import (
@@ -275,6 +275,7 @@ def _(
     return q, -change / jax.grad(force, argnums=1)(e, q, material)
 
 
+@usual_rules
 def rod(
     line: Line,
     height: Numbers,
@@ -333,6 +334,7 @@ def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
     return x[..., :2] + attachment.eccentricity[..., None] * normal
 
 
+@usual_rules
 def rod_tendons(
     line: Line,
     nodes: Numbers,
@@ -382,6 +384,7 @@ class Estimate(NamedTuple):
     tensions: jax.Array
 
 
+@usual_rules
 def euler_bernoulli(
     ratios: Numbers,
     length: Numbers = 3.5,

@@ -16,7 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, index_field, is_concrete, key_of, namespace, pytree, read_only, replace, to_device
+from jaxbeam._tree import (
+    Numbers,
+    index_field,
+    is_concrete,
+    key_of,
+    namespace,
+    pytree,
+    read_only,
+    replace,
+    to_device,
+    usual_rules,
+)
 from jaxbeam.anchors import surface_of
 from jaxbeam.materials import Lame, lame, macklin_mueller
 from jaxbeam.mesh import Diagonals, Mesh, middle_column, rectangle, with_middles
@@ -78,6 +89,7 @@ class Scene:
             raise ValueError(f"terms: expected a tuple of at least one Term, got {self.terms!r}")
         for number, term in enumerate(self.terms):
             check_nodes(f"terms[{number}].nodes", self.mesh, term.nodes, ndim=2)
+            _check_dtype(number, term, self.mesh.nodes.dtype)
             energy = term.energy
             _check_energy(number, term, self.mesh.nodes)
             of_solids = isinstance(energy, SolidEnergy) or (
@@ -90,6 +102,16 @@ class Scene:
         object.__setattr__(self, "tip", read_only(tip, np.int32))
         bodies = tuple(key_of(term, "nodes") for term in self.terms if isinstance(term.energy, SolidEnergy))
         object.__setattr__(self, "surface", surface_of(bodies))
+
+
+def _check_dtype(number: int, term: Term, dtype: Any) -> None:
+    """Refuse parameters of more digits than the nodes have: energies would have another dtype than positions."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(term.params):
+        if leaf.dtype.kind == "f" and leaf.dtype.itemsize > dtype.itemsize:
+            raise ValueError(
+                f"terms[{number}].params{jax.tree_util.keystr(path)}: expected {dtype}, the dtype of the mesh's nodes, "
+                f"got {leaf.dtype}; build the terms on the same mesh, or convert with .astype({dtype})"
+            )
 
 
 def _check_energy(number: int, term: Term, nodes: jax.Array) -> None:
@@ -110,6 +132,12 @@ def _traced_once(name: str, energy: Callable[..., jax.Array], structure: Any, sh
 def check_scene(scene: Scene) -> None:
     """Refuse what is not a scene."""
     checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
+    dtype = scene.mesh.nodes.dtype
+    if dtype == np.float64 and jnp.result_type(float) != dtype:
+        raise ValueError(
+            "scene: its nodes are float64, which JAX computes with only where jax_enable_x64 is on; set "
+            'jax.config.update("jax_enable_x64", True), or build the scene with dtype=jnp.float32'
+        )
 
 
 def placed(scene: Scene, x: Numbers, name: str = "x") -> jax.Array:
@@ -126,6 +154,7 @@ def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
     return fixed
 
 
+@usual_rules
 def tendon_beam(
     nx: int = 29,
     ny: int = 7,
@@ -185,6 +214,7 @@ def tendon_beam(
     return Scene(mesh, (body, pulls), clamped(mesh, left), right)
 
 
+@usual_rules
 def rod_beam(
     nodes: int = 9,
     length: Numbers = 3.5,
@@ -233,6 +263,7 @@ def rod_beam(
     return Scene(line, (body, pulls), clamped(line, [0]), np.array([nodes - 1]))
 
 
+@usual_rules
 def command(scene: Scene, ratios: Numbers) -> Scene:
     """The scene with new commanded lengths, `ratio * natural length`.
 
@@ -350,17 +381,20 @@ def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
     return Evaluation(energy, energy_scale, both[..., 0], both[..., 1])
 
 
+@usual_rules
 def energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Total energy `()` at node positions `x` `(n, 2)`; differentiable in the scene and in `x`."""
     x = placed(scene, x)
     return sum((jnp.sum(jax.vmap(t.energy)(x[t.nodes], t.params)) for t in scene.terms), jnp.zeros((), x.dtype))
 
 
+@usual_rules
 def forces(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of all terms on each node: minus the gradient of the energy."""
     return -evaluate(scene, placed(scene, x)).gradient
 
 
+@usual_rules
 def reactions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of the clamp on each node, zero for coordinates that are free.
 
@@ -375,6 +409,7 @@ def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[j
     return [stencil_hessian(term, x, convex) for term in scene.terms]
 
 
+@usual_rules
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
     """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods; infinite if there are
     neither. It is not only looked for at quadrature points."""

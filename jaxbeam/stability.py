@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, blank, pytree, unlock
+from jaxbeam._tree import Numbers, blank, pytree, unlock, usual_rules
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand
 from jaxbeam.newton import Newton, check_asked, topology
 from jaxbeam.scene import Scene, placed, stencil_hessians
@@ -37,6 +37,7 @@ class Modes:
     negative: jax.Array
 
 
+@usual_rules
 def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newton()) -> Modes:
     """The lowest eigenvalues of the tangent stiffness at `x`, and their shapes.
 

@@ -24,7 +24,7 @@ from jax import lax
 from jax.sharding import PartitionSpec
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, blank, compiled, is_concrete, to_device, unlock
+from jaxbeam._tree import Numbers, blank, compiled, is_concrete, to_device, unlock, usual_rules
 from jaxbeam.equilibrium import differentiable_rows
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
@@ -44,6 +44,7 @@ GAP = 0.005
 STRAIGHT = 1e-12
 
 
+@usual_rules
 def sweep(
     scene: Scene,
     ratios: Numbers,

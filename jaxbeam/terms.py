@@ -16,7 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam import checks
-from jaxbeam._tree import Numbers, index_field, is_concrete, namespace, pytree, read_only, static_field, to_device
+from jaxbeam._tree import (
+    Numbers,
+    index_field,
+    is_concrete,
+    namespace,
+    pytree,
+    read_only,
+    static_field,
+    to_device,
+    usual_rules,
+)
 from jaxbeam.anchors import patch
 from jaxbeam.elements import rule, shape_slopes
 from jaxbeam.materials import check_density, macklin_mueller
@@ -96,7 +106,8 @@ def forbids_inversion(energy: SolidEnergy, params: SolidParams) -> bool:
     """Whether the density is infinite or undefined for an inverted element, as a logarithmic one is."""
     ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
     inverted = np.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
-    with jax.ensure_compile_time_eval():
+    # That it may be NaN is what is asked.
+    with jax.ensure_compile_time_eval(), jax.debug_nans(False):
         return not np.isfinite(jax.jit(energy.density)(inverted, ones))
 
 
@@ -105,6 +116,7 @@ def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
     return jnp.einsum("ki,qkj->qij", x - params.rest, params.gradients)
 
 
+@usual_rules
 def solid(
     mesh: Mesh,
     params: Any,
@@ -246,6 +258,7 @@ def polyline_length(x: jax.Array) -> jax.Array:
     return xp.sum(xp.where(apart, xp.sqrt(xp.where(apart, squared, 1)), 0), axis=-1)
 
 
+@usual_rules
 def tendons(
     mesh: Mesh,
     nodes: Numbers,
@@ -334,6 +347,7 @@ def penalty_energy(x: jax.Array, params: PointParams) -> jax.Array:
     return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
 
 
+@usual_rules
 def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     """Constant forces on nodes.
 
@@ -354,6 +368,7 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     return Term(dead_load_energy, where[:, None], PointParams(rest, values))
 
 
+@usual_rules
 def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
     """Springs that hold nodes near their rest positions: a soft clamp.
 
