@@ -237,8 +237,8 @@ def test_no_slope_is_no_information(small):
 
 
 def test_each_of_several_targets_with_slack_tendons():
-    """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that is slack where the first ended,
-    where only the other one has an effect."""
+    """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that
+    is slack where the first ended, where only the other one has an effect."""
     found = jax.jit(partial(jb.reach_each, threaded(1.2)))(jnp.array([4.0, jnp.nan, -4.0]))
     assert np.asarray(found.status).tolist() == [REACHED, NOT_CONVERGED, REACHED]
 

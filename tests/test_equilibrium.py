@@ -7,6 +7,9 @@ import pytest
 from helpers import PAIR_NODES, affine, forces, macneal_harder, reactions, small_beam, spring_pair, traces
 
 import jaxbeam as jb
+from jaxbeam._tree import unlock
+from jaxbeam.newton import newton, row_magnitudes, topology
+from jaxbeam.scene import stencil_hessians
 
 # Converged answers of two independent codes: ratios, tip angle in degrees and lengths of the tendons where known.
 REFERENCE = [
@@ -419,6 +422,27 @@ def test_status_is_a_flag():
     assert jb.Status.OK == 0
     assert not jb.Status(0)
     assert [int(flag) for flag in jb.Status] == [1, 2, 4, 8, 16, 32, 64]
+
+
+def test_a_state_on_the_way_keeps_its_stiffness_for_a_step_of_a_millionth():
+    """As `ramp` says of states on the way. A longer last step has it made anew, however well the forces balance."""
+    scene, solver = spring_pair(0.9), jb.Newton(rtol=1e-8, linear=jb.Dense())
+    layout, no = solver.linear.layout(topology(scene)), jnp.asarray(False)
+
+    @jax.jit
+    def off(scene, aside):
+        """How far the stiffness is from that at the end of Newton's method, and the number of its steps."""
+        x = scene.mesh.nodes
+        start = x.at[2].add(jnp.stack([0.6 * aside, 0.8 * aside]))
+        state = newton(scene, layout, start, 0 * x, jnp.asarray(9), 0, ~no, no, lambda x, definite: 0 * x, solver)
+        true = row_magnitudes(scene, stencil_hessians(scene, state.x))
+        return jnp.max(jnp.abs(state.stiffness.rows - true)) / jnp.max(true), state.counts[0]
+
+    # One step each. The stiffness is a quotient of lengths, so it changes by about the share that the node moves.
+    near, far = off(unlock(scene), 1e-7), off(unlock(scene), 1e-3)
+    assert int(near[1]) == int(far[1]) == 1
+    assert 1e-8 < near[0] < 1e-6
+    assert far[0] < 1e-14
 
 
 # --------------------------------------------------------------------------------------- check
