@@ -310,6 +310,9 @@ def test_limit_of_stability_is_inaccurate():
     assert abs(float(jb.lowest_mode(spring_pair(1.0), solution.x).values[0])) < 1e-15
     with pytest.raises(jb.EquilibriumError, match=r"INACCURATE: .* whether the equilibrium is stable: use float64"):
         jb.check(solution)
+    # The stiffness across is 6 times the distance from ratio 1, and its round-off is eps times 6.
+    nearly = jb.equilibrium(spring_pair(np.nextafter(1.0, 0.0)))
+    assert int(nearly.status) == jb.Status.INACCURATE
     for ratio in (1 - 1e-9, 1 + 1e-9):
         assert not int(jb.equilibrium(spring_pair(ratio), solver=STAY).status) & jb.Status.INACCURATE
 
