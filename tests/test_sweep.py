@@ -13,6 +13,7 @@ from helpers import small_beam, traces
 
 import jaxbeam as jb
 from jaxbeam.predictor import ahead, begin, extend
+from jaxbeam.rod import rod, rod_tendons, straight
 
 # The package's name `sweep` is the function; its module is found through it.
 module = sys.modules["jaxbeam.sweep"]
@@ -108,6 +109,20 @@ def test_dead_loads_are_applied(small):
     found = jb.check(jb.sweep(loaded, LINE[::6]))
     for row, x in zip(LINE[::6], found.x, strict=True):
         np.testing.assert_allclose(x, jb.equilibrium(jb.command(loaded, row)).x, rtol=0, atol=1e-9)
+
+
+def test_a_load_too_large_for_one_step_is_applied_in_parts():
+    """A moment that bends a slender rod to a full circle takes 228 steps, of which the first half of it takes some 100.
+    Were the whole load there from the beginning, each attempt would start at rest, and it would take 314."""
+    line, height = straight(1.0, 0.01, 9), 0.01
+    terms = (
+        rod(line, height, jb.lame(12 / height**3, 0.0), jb.linear_elastic),  # EI = 1
+        rod_tendons(line, [[0, 8]], [[height / 2, height / 2]], 1.0),
+        jb.dead_load(line, [8], [0.0, 0.0, 2 * np.pi / height]),
+    )
+    scene = jb.Scene(line, terms, jb.clamped(line, [0]), [8])
+    found = jb.sweep(scene, [[1.0]], jb.Newton(max_steps=240, linear=jb.Dense()))
+    assert float(found.reached[0]) >= 0.5
 
 
 def test_partition_is_of_near_ones():
