@@ -48,24 +48,29 @@ def test_close_neighbours_leave_no_step(small):
     assert (np.asarray(found.residual) <= found.tolerance).all()
 
 
-def test_chunks_change_nothing_but_the_work(small, chunks_of_five):
+@pytest.fixture(scope="module")
+def finer():
+    """Its chunks of five are compiled once for two tests."""
+    return jb.tendon_beam(15, 5)
+
+
+def test_chunks_change_nothing_but_the_work(finer, chunks_of_five):
     seen = []
-    whole = jb.sweep(small, LINE, progress=lambda done, total: seen.append((done, total)))
+    whole = jb.sweep(finer, LINE, progress=lambda done, total: seen.append((done, total)))
     assert [done for done, _ in seen] == [5, 10, 15, 20, 25] and {total for _, total in seen} == {25}
     order = np.random.default_rng(0).permutation(25)
-    shuffled = jb.sweep(small, LINE[order])
+    shuffled = jb.sweep(finer, LINE[order])
     np.testing.assert_array_equal(shuffled.x, whole.x[order])  # to the last bit: chunks do not depend on the order
 
 
-def test_cores_change_nothing(small, chunks_of_five, monkeypatch):
+def test_cores_change_nothing(finer, chunks_of_five, monkeypatch):
     """Also where Hessians are projected in several threads at once."""
-    beam = jb.tendon_beam(15, 5)
     side = np.linspace(0.25, 0.6, 6)
     rows = np.stack([a.ravel() for a in np.meshgrid(side, side)], axis=1)
     results = []
     for cores in (1, 4):
         monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
-        results.append(jb.sweep(beam, rows))
+        results.append(jb.sweep(finer, rows))
     assert int(np.sum(results[0].projected)) > 0
     for one, many in zip(jax.tree.leaves(results[0]), jax.tree.leaves(results[1]), strict=True):
         np.testing.assert_array_equal(one, many)
