@@ -7,6 +7,7 @@ import pytest
 from helpers import small_beam, spring_pair, traces
 
 import jaxbeam as jb
+from jaxbeam.scene import partway
 
 ROWS = np.array([[0.5, 1.0], [1.2, 0.8], [0.9, 0.7]])
 
@@ -30,6 +31,22 @@ def check_same(batch, alone):
         # Residual 1e-10 of the tendon's force, over the stiffness of a beam that it bends by order 1.
         np.testing.assert_allclose(batch.x[k], solution.x, rtol=0, atol=1e-9)
         assert int(batch.status[k]) == int(solution.status)
+
+
+# ----------------------------------------------------------------------------------------------- partway
+
+
+def test_partway_is_a_fraction_of_the_actuation(small):
+    """Of each tendon's shortening and of each dead load; springs stay as they are, and so does what is at rest."""
+    terms = (jb.dead_load(small.mesh, [13], [3.0, -5.0]), jb.penalty_springs(small.mesh, [7], 10.0))
+    scene = jb.command(jb.Scene(small.mesh, (*small.terms, *terms), small.fixed, small.tip), [0.6, 1.2])
+    for share in (0.0, 0.25, 1.0):
+        body, pulls, load, springs = partway(scene, share).terms
+        np.testing.assert_allclose(pulls.params.commanded / pulls.params.natural, 1 + share * np.array([-0.4, 0.2]))
+        np.testing.assert_allclose(load.params.value, [[share * 3.0, share * -5.0]], rtol=1e-15)
+        for same, whole in ((body, scene.terms[0]), (springs, scene.terms[3])):
+            for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(whole), strict=True):
+                np.testing.assert_array_equal(a, b)
 
 
 # ------------------------------------------------------------------------------------------------ ramp

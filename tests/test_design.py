@@ -90,11 +90,13 @@ def test_beyond_the_peak(beam):
     """With more room the angle has a peak inside the bounds: no bound is in the way of 50 degrees, and none holds."""
     found = jb.reach(beam, 50.0, bounds=(0.2, 1.0))
     ratios = np.linspace(0.25, 0.4, 61)  # at 0.2 the beam passes through itself
-    angles = [solved(beam, [ratio, 1.0]) for ratio in ratios]
+    swept = jb.check(jb.sweep(beam, np.stack([ratios, np.ones(61)], axis=1)))
+    angles = np.asarray(jax.vmap(lambda x: jb.tip_angle(beam, x))(swept.x))
     assert int(found.status) == UNREACHABLE
     np.testing.assert_array_equal(found.held, [0, 1])
     assert abs(float(found.value) - max(angles)) <= 0.01
-    assert float(found.value) >= max(angles)
+    # A sweep leaves forces unbalanced by 1e-10 of the largest.
+    assert float(found.value) >= max(angles) - 1e-8
     assert abs(float(found.theta[0]) - ratios[np.argmax(angles)]) < 0.003
 
 
@@ -147,9 +149,11 @@ def test_path_of_targets(beam):
 # -------------------------------------------------------------------------------------- bounds that hold
 
 
-@pytest.fixture(scope="module")
-def small():
-    return small_beam()
+@jax.jit
+@partial(jax.grad, argnums=1)
+def slope_of_angle(scene, theta):
+    scene = jb.command(scene, theta)
+    return jb.tip_angle(scene, jb.equilibrium(scene).x)
 
 
 @pytest.mark.parametrize(
@@ -158,23 +162,18 @@ def small():
         (8.0, (0.4, 1.0), [0, 1]),
         (-8.0, (0.4, 1.0), [1, 0]),
         (8.0, (0.4, 1.6), [0, 0]),
-        (4.0, ([0.85, 0.4], [1.0, 1.6]), [-1, 0]),
+        (4.0, ([0.95, 0.4], [1.0, 1.6]), [-1, 0]),
         (8.0, ([0.4, 1.2], 1.6), [0, -1]),
         (0.0, (0.4, 1.0), [0, 0]),
     ],
 )
-def test_bounds_that_hold_where_a_target_is_reached(small, target, bounds, held):
+def test_bounds_that_hold_where_a_target_is_reached(beam, target, bounds, held):
     """By Lagrange's condition: with the price that balances the effort of the free commands, each command that is held
     would be moved out of its bounds. Commands at rest are at the bound of 1, and it does not hold them."""
-    found = jb.reach(small, target, bounds=bounds)
+    found = jb.reach(beam, target, bounds=bounds)
     assert int(found.status) == REACHED
     np.testing.assert_array_equal(found.held, held)
-
-    def angle(theta):
-        scene = jb.command(small, theta)
-        return jb.tip_angle(scene, jb.equilibrium(scene).x)
-
-    slope, short = np.asarray(jax.jit(jax.grad(angle))(found.theta)), 1 - np.asarray(found.theta)
+    slope, short = np.asarray(slope_of_angle(beam, found.theta)), 1 - np.asarray(found.theta)
     free = np.asarray(held) == 0
     price = short[free] @ slope[free] / (slope[free] @ slope[free])
     pull = short - price * slope
@@ -183,11 +182,11 @@ def test_bounds_that_hold_where_a_target_is_reached(small, target, bounds, held)
 
 
 @pytest.mark.parametrize("target", [2.0, 5.0, 8.0, 20.0])
-def test_curvature_saves_solves(small, target):
+def test_curvature_saves_solves(beam, target):
     """Where no bound holds, both commands are weighed: quadratic convergence needs the measure's own curvature."""
-    found = jb.reach(small, target, bounds=(0.4, 1.6))
+    found = jb.reach(beam, target, bounds=(0.4, 1.6))
     assert int(found.status) == REACHED and not np.asarray(found.held).any()
-    assert int(found.solves) <= 8
+    assert int(found.solves) <= 7
 
 
 # ------------------------------------------------------------------------------- where commands do nothing
@@ -222,6 +221,11 @@ def test_slack_tendons_are_shortened_until_they_pull(slack, target):
     assert float(found.theta[1 - working]) == 1 and float(found.theta[working]) < 1 / slack
 
 
+@pytest.fixture(scope="module")
+def small():
+    return small_beam()
+
+
 def over_two_degrees(scene, x):
     return jnp.maximum(jb.tip_angle(scene, x) - 2, 0)
 
@@ -237,8 +241,8 @@ def test_no_slope_is_no_information(small):
 
 
 def test_each_of_several_targets_with_slack_tendons():
-    """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that is slack where the first ended,
-    where only the other one has an effect."""
+    """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that
+    is slack where the first ended, where only the other one has an effect."""
     found = jax.jit(partial(jb.reach_each, threaded(1.2)))(jnp.array([4.0, jnp.nan, -4.0]))
     assert np.asarray(found.status).tolist() == [REACHED, NOT_CONVERGED, REACHED]
 

@@ -7,6 +7,9 @@ import pytest
 from helpers import PAIR_NODES, affine, forces, macneal_harder, reactions, small_beam, spring_pair, traces
 
 import jaxbeam as jb
+from jaxbeam._tree import unlock
+from jaxbeam.newton import newton, row_magnitudes, topology
+from jaxbeam.scene import stencil_hessians
 
 # Converged answers of two independent codes: ratios, tip angle in degrees and lengths of the tendons where known.
 REFERENCE = [
@@ -307,6 +310,9 @@ def test_limit_of_stability_is_inaccurate():
     assert abs(float(jb.lowest_mode(spring_pair(1.0), solution.x).values[0])) < 1e-15
     with pytest.raises(jb.EquilibriumError, match=r"INACCURATE: .* whether the equilibrium is stable: use float64"):
         jb.check(solution)
+    # The stiffness across is 6 times the distance from ratio 1, and its round-off is eps times 6.
+    nearly = jb.equilibrium(spring_pair(np.nextafter(1.0, 0.0)))
+    assert int(nearly.status) == jb.Status.INACCURATE
     for ratio in (1 - 1e-9, 1 + 1e-9):
         assert not int(jb.equilibrium(spring_pair(ratio), solver=STAY).status) & jb.Status.INACCURATE
 
@@ -320,25 +326,26 @@ def test_softer_than_round_off_is_inaccurate():
     assert np.abs(np.asarray(single.x) - np.asarray(jb.check(double).x)).max() > 1e-3
 
 
-@pytest.mark.parametrize("load", [0.0, 1e-3])
-def test_traced_scene_that_is_not_held_is_flagged(load):
+def test_traced_scene_that_is_not_held_is_flagged():
     """Concrete, it is refused before any solve; traced, its rigid motions leave the stability open."""
     mesh = jb.rectangle(2.0, 1.0, 5, 3)
 
-    def status(nodes):
+    def status(nodes, load):
         loose = jb.Mesh(nodes, mesh.elements)
-        terms = (jb.solid(loose, jb.lame(1.0, 0.3)), jb.dead_load(loose, [14], [load, 0.0]))
+        terms = (jb.solid(loose, jb.lame(1.0, 0.3)), jb.dead_load(loose, [14], jnp.array([1.0, 0.0]) * load))
         return jb.equilibrium(jb.Scene(loose, terms, np.zeros((15, 2), bool))).status
 
-    assert int(jax.jit(status)(mesh.nodes)) & (jb.Status.INACCURATE | jb.Status.NOT_CONVERGED)
-    with pytest.raises(ValueError, match="fixed: the body is not held"):
-        status(mesh.nodes)
+    traced = jax.jit(status)
+    for load in (0.0, 1e-3):
+        assert int(traced(mesh.nodes, load)) & (jb.Status.INACCURATE | jb.Status.NOT_CONVERGED)
+        with pytest.raises(ValueError, match="fixed: the body is not held"):
+            status(mesh.nodes, load)
 
 
-def triangle(density, load=None):
+def triangle(density, load=0.0):
     """One triangle, its base clamped, its apex free."""
     mesh = jb.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
-    terms = (jb.solid(mesh, jb.Lame(3.0, 7.0), density), jb.dead_load(mesh, [2], [0.0, load or 0.0]))
+    terms = (jb.solid(mesh, jb.Lame(3.0, 7.0), density), jb.dead_load(mesh, [2], jnp.array([0.0, 1.0]) * load))
     return jb.Scene(mesh, terms, jb.clamped(mesh, [0, 1]))
 
 
@@ -358,16 +365,16 @@ def test_inverted_equilibrium_is_not_ok():
     solve = jax.jit(lambda x0: jb.equilibrium(scene, x0, jb.Newton(max_steps=0)))
     solution = solve(TURNED_OVER)
     assert int(solution.status) & jb.Status.INVERTED
-    assert int(jb.equilibrium(scene).status) == jb.Status.OK
+    assert int(solve(np.asarray(scene.mesh.nodes)).status) == jb.Status.OK
     with pytest.raises(jb.EquilibriumError, match=r"INVERTED: residual .* in element 0.*an element is turned"):
         jb.check(solution)
 
 
 def test_logarithm_stays_on_its_side():
     """Started inside out where that cannot be refused, it is recovered from rest; no step crosses J = 0."""
-    solve = jax.jit(lambda x0: jb.equilibrium(triangle(jb.neo_hookean), x0))
-    np.testing.assert_allclose(jb.check(solve(TURNED_OVER)).x[2], [0, 1], atol=1e-9)
-    pressed = jb.check(jb.equilibrium(triangle(jb.neo_hookean, load=-30.0)))
+    solve = jax.jit(lambda x0, load: jb.equilibrium(triangle(jb.neo_hookean, load), x0))
+    np.testing.assert_allclose(jb.check(solve(TURNED_OVER, 0.0)).x[2], [0, 1], atol=1e-9)
+    pressed = jb.check(solve(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), -30.0))
     d = float(pressed.x[2, 1])
     # By hand, F = diag(1, d), area 1/2: (mu d + (lam ln d - mu) / d) / 2 = load.
     np.testing.assert_allclose((3 * d + (7 * np.log(d) - 3) / d) / 2, -30.0, rtol=1e-9)
@@ -385,23 +392,14 @@ def test_poisoned_parameter_is_nonfinite(steered):
             jb.check(solution)
 
 
-def out_of_range_commands():
-    return [[-0.4, 1.0], [0.0, 1.0], [np.nan, 1.0], [np.inf, 1.0]]
-
-
-@pytest.mark.parametrize("ratios", out_of_range_commands())
-def test_traced_commands_out_of_range_are_flagged(beam, ratios):
+def test_traced_commands_and_poissons_out_of_range_are_flagged():
     """Where a value is traced there is no `ValueError`; the status says it."""
-    solve = jax.jit(lambda ratios: jb.equilibrium(jb.command(beam, ratios)).status)
-    assert int(solve(jnp.array(ratios))) & jb.Status.INVALID
-    assert int(solve(jnp.array([0.9, 1.0]))) == jb.Status.OK
-
-
-@pytest.mark.parametrize("poisson", [0.5, 0.7, -1.0, -1.3])
-def test_traced_poisson_out_of_range_is_flagged(poisson):
-    solve = jax.jit(lambda nu: jb.equilibrium(jb.tendon_beam(5, 3, poisson=nu)).status)
-    assert int(solve(poisson)) & jb.Status.INVALID
-    assert int(solve(0.3)) == jb.Status.OK
+    solve = jax.jit(lambda r, nu: jb.equilibrium(jb.command(jb.tendon_beam(5, 3, poisson=nu), r)).status)
+    assert int(solve(jnp.array([0.9, 1.0]), 0.3)) == jb.Status.OK
+    for ratios in ([-0.4, 1.0], [0.0, 1.0], [np.nan, 1.0], [np.inf, 1.0]):
+        assert int(solve(jnp.array(ratios), 0.3)) & jb.Status.INVALID, ratios
+    for poisson in (0.5, 0.7, -1.0, -1.3):
+        assert int(solve(jnp.array([0.9, 1.0]), poisson)) & jb.Status.INVALID, poisson
 
 
 def test_load_beyond_the_material_is_inverted():
@@ -419,6 +417,27 @@ def test_status_is_a_flag():
     assert jb.Status.OK == 0
     assert not jb.Status(0)
     assert [int(flag) for flag in jb.Status] == [1, 2, 4, 8, 16, 32, 64]
+
+
+def test_a_state_on_the_way_keeps_its_stiffness_for_a_step_of_a_millionth():
+    """As `ramp` says of states on the way. A longer last step has it made anew, however well the forces balance."""
+    scene, solver = spring_pair(0.9), jb.Newton(rtol=1e-8, linear=jb.Dense())
+    layout, no = solver.linear.layout(topology(scene)), jnp.asarray(False)
+
+    @jax.jit
+    def off(scene, aside):
+        """How far the stiffness is from that at the end of Newton's method, and the number of its steps."""
+        x = scene.mesh.nodes
+        start = x.at[2].add(jnp.stack([0.6 * aside, 0.8 * aside]))
+        state = newton(scene, layout, start, 0 * x, jnp.asarray(9), 0, ~no, no, lambda x, definite: 0 * x, solver)
+        true = row_magnitudes(scene, stencil_hessians(scene, state.x))
+        return jnp.max(jnp.abs(state.stiffness.rows - true)) / jnp.max(true), state.counts[0]
+
+    # One step each. The stiffness is a quotient of lengths, so it changes by about the share that the node moves.
+    near, far = off(unlock(scene), 1e-7), off(unlock(scene), 1e-3)
+    assert int(near[1]) == int(far[1]) == 1
+    assert 1e-8 < near[0] < 1e-6
+    assert far[0] < 1e-14
 
 
 # --------------------------------------------------------------------------------------- check

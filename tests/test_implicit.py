@@ -388,18 +388,24 @@ def test_a_gradient_takes_no_newton_steps():
     np.testing.assert_array_equal(batch.steps, plain)
 
 
-def test_float32():
-    """The gradient of a float32 scene is float32, and near that of the same scene in float64."""
+def single_slope(theta):
+    """The gradient of the tip angle of a float32 scene."""
     single = jb.tendon_beam(7, 5, dtype=jnp.float32)
-    theta = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), THETA)
 
-    @jit
-    @jax.grad
-    def slope(theta):
+    def angle(theta):
         scene = built(single, theta)
         return jb.tip_angle(scene, jb.equilibrium(scene, None, jb.Newton(linear=jb.Dense())).x)
 
-    by_theta = slope(theta)
+    return jax.grad(angle)(theta)
+
+
+SINGLE_THETA = jax.tree.map(lambda leaf: leaf.astype(np.float32), THETA)
+
+
+@pytest.mark.slow
+def test_float32_of_a_beam():
+    """The gradient of a float32 scene is near that of the same scene in float64."""
+    by_theta = jit(single_slope)(SINGLE_THETA)
     (expected, _), _ = slopes(stacked([THETA] * COUNT), stacked([THETA["nodes"]] * COUNT))
     for got, wanted in zip(jax.tree.leaves(by_theta), jax.tree.leaves(expected), strict=True):
         assert got.dtype == jnp.float32
@@ -439,6 +445,23 @@ def test_closed_form():
     for name in ("forward", "reverse"):
         np.testing.assert_allclose(at[name], jit(jax.grad(apex))(TAUT), rtol=1e-10)
     np.testing.assert_allclose(at["hessian"], jit(jax.hessian(apex))(TAUT), rtol=1e-10)
+
+
+def test_float32():
+    """The gradient of a float32 scene is float32: of a beam by its shapes, of the springs also near the closed form."""
+    assert {leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(single_slope, SINGLE_THETA))} == {jnp.float32.dtype}
+    pair = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), PAIR)
+
+    @jit
+    @jax.grad
+    def slope(ratios):
+        solution = jb.equilibrium(jb.command(pair, ratios), ABOVE.astype(jnp.float32), jb.Newton(linear=jb.Dense()))
+        return solution.x[2] @ jnp.array([1.0, 2.0], jnp.float32)
+
+    found = slope(TAUT.astype(np.float32))
+    assert found.dtype == jnp.float32
+    # Forces balance to 1e-6.
+    np.testing.assert_allclose(found, jit(jax.grad(apex))(TAUT), rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -553,7 +576,9 @@ def expected():
     return {1: np.asarray(slope(jnp.asarray(BENT))), 2: second, 3: np.array([[x, mixed], [mixed, y]])}
 
 
-FAST = [("ramp", "frr"), ("sweep", "fr"), ("checkpointed map", "rr")]
+# A ramp and a sweep are differentiated by the same function. Third derivatives compile for half a minute; in default
+# runs the rule under them is differentiated thrice in test_rules.py.
+FAST = [("sweep", "fr"), ("checkpointed map", "rr")]
 ALL = [(solver, modes) for solver in SOLVED for modes in ("ff", "fr", "rf", "rr", "frr", "rrr", "fff")]
 
 

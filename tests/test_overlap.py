@@ -97,6 +97,9 @@ def test_two_pieces():
     )
     scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)),), jb.clamped(mesh, [0, 1, 4, 5]))
     assert (np.asarray(crossed(scene, mesh.nodes)) == -1).all()
+    # Side by side: their faces lie in one line and touch, and corners of the one are on an edge of the other.
+    beside = np.asarray(mesh.nodes) - np.repeat([[0.0, 0.0], [1.0, 0.0]], 4, axis=0)
+    assert (np.asarray(crossed(scene, jnp.asarray(beside))) == -1).all()
     moved = np.asarray(mesh.nodes) - np.repeat([[0.0, 0.0], [1.5, 0.0]], 4, axis=0)
     assert (np.asarray(crossed(scene, jnp.asarray(moved))) >= 0).all()
 

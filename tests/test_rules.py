@@ -64,6 +64,24 @@ def test_derivatives_of_an_implicit_function(way, modes):
     np.testing.assert_allclose(f(jnp.asarray(1.3)), exact(1.3)[len(modes)], rtol=1e-12)
 
 
+def test_maps_in_maps_over_different_arguments():
+    """Each level is mapped over an argument of its own, of a length of its own."""
+
+    @custom_derivative
+    def quotient(a, b):
+        return a / b
+
+    @quotient.defjvp
+    def _(primals, tangents):
+        (a, b), (da, db) = primals, tangents
+        return quotient(a, b), da / b - a * db / b**2
+
+    a, b = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, 5.0])
+    table = jax.vmap(jax.vmap(quotient, in_axes=(None, 0)), in_axes=(0, None))
+    np.testing.assert_allclose(table(a, b), a[:, None] / b, rtol=1e-15)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda b: jnp.sum(table(a, b))))(b), -6 / b**2, rtol=1e-15)
+
+
 def test_a_batch_differs_in_some_arguments_only():
     @custom_derivative
     def ratio(scale, parts):

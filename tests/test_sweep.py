@@ -13,6 +13,7 @@ from helpers import small_beam, traces
 
 import jaxbeam as jb
 from jaxbeam.predictor import ahead, begin, extend
+from jaxbeam.rod import rod, rod_tendons, straight
 
 # The package's name `sweep` is the function; its module is found through it.
 module = sys.modules["jaxbeam.sweep"]
@@ -47,24 +48,29 @@ def test_close_neighbours_leave_no_step(small):
     assert (np.asarray(found.residual) <= found.tolerance).all()
 
 
-def test_chunks_change_nothing_but_the_work(small, chunks_of_five):
+@pytest.fixture(scope="module")
+def finer():
+    """Its chunks of five are compiled once for two tests."""
+    return jb.tendon_beam(15, 5)
+
+
+def test_chunks_change_nothing_but_the_work(finer, chunks_of_five):
     seen = []
-    whole = jb.sweep(small, LINE, progress=lambda done, total: seen.append((done, total)))
+    whole = jb.sweep(finer, LINE, progress=lambda done, total: seen.append((done, total)))
     assert [done for done, _ in seen] == [5, 10, 15, 20, 25] and {total for _, total in seen} == {25}
     order = np.random.default_rng(0).permutation(25)
-    shuffled = jb.sweep(small, LINE[order])
+    shuffled = jb.sweep(finer, LINE[order])
     np.testing.assert_array_equal(shuffled.x, whole.x[order])  # to the last bit: chunks do not depend on the order
 
 
-def test_cores_change_nothing(small, chunks_of_five, monkeypatch):
+def test_cores_change_nothing(finer, chunks_of_five, monkeypatch):
     """Also where Hessians are projected in several threads at once."""
-    beam = jb.tendon_beam(15, 5)
     side = np.linspace(0.25, 0.6, 6)
     rows = np.stack([a.ravel() for a in np.meshgrid(side, side)], axis=1)
     results = []
     for cores in (1, 4):
         monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
-        results.append(jb.sweep(beam, rows))
+        results.append(jb.sweep(finer, rows))
     assert int(np.sum(results[0].projected)) > 0
     for one, many in zip(jax.tree.leaves(results[0]), jax.tree.leaves(results[1]), strict=True):
         np.testing.assert_array_equal(one, many)
@@ -108,6 +114,20 @@ def test_dead_loads_are_applied(small):
     found = jb.check(jb.sweep(loaded, LINE[::6]))
     for row, x in zip(LINE[::6], found.x, strict=True):
         np.testing.assert_allclose(x, jb.equilibrium(jb.command(loaded, row)).x, rtol=0, atol=1e-9)
+
+
+def test_a_load_too_large_for_one_step_is_applied_in_parts():
+    """A moment that bends a slender rod to a full circle takes 228 steps, of which the first half of it takes some 100.
+    Were the whole load there from the beginning, each attempt would start at rest, and it would take 314."""
+    line, height = straight(1.0, 0.01, 9), 0.01
+    terms = (
+        rod(line, height, jb.lame(12 / height**3, 0.0), jb.linear_elastic),  # EI = 1
+        rod_tendons(line, [[0, 8]], [[height / 2, height / 2]], 1.0),
+        jb.dead_load(line, [8], [0.0, 0.0, 2 * np.pi / height]),
+    )
+    scene = jb.Scene(line, terms, jb.clamped(line, [0]), [8])
+    found = jb.sweep(scene, [[1.0]], jb.Newton(max_steps=240, linear=jb.Dense()))
+    assert float(found.reached[0]) >= 0.5
 
 
 def test_partition_is_of_near_ones():

@@ -58,7 +58,8 @@ def everything() -> Problem:
 PROBLEMS = {"solid": everything, **{name: lambda name=name: rod(name) for name in ("macklin_mueller", "neo_hookean")}}
 
 
-@pytest.mark.parametrize("kind", PROBLEMS)
+# Of the rods one is enough: the judge's densities are compared with the library's in test_properties.py.
+@pytest.mark.parametrize("kind", ["solid", "macklin_mueller", pytest.param("neo_hookean", marks=pytest.mark.slow)])
 def test_energy_and_forces_are_the_librarys(kind):
     raw = PROBLEMS[kind]()
     ratios = np.array([0.8, 1.1, 0.9])[: sum(len(t.lines) for t in raw.tendons)]
