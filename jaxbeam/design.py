@@ -100,11 +100,11 @@ def reach(
         which bounds are in the way, or `NOT_CONVERGED`: also where no command has an effect on the measure, at the
         start and as they are shortened.
 
-    `theta`, `solution` (as that of `equilibrium`), `value` and `loss` are differentiable in `target`, `bounds` and every
-    float of the scene, forward, reverse and to any order, by the conditions that an optimum satisfies (see
-    `jaxbeam.optimum`); not in `starts`. `history` is a record and does not move. The derivative is NaN where the status is `NOT_CONVERGED`, where the
-    optimum is not isolated, and where a command lies at a bound that does not hold it, for it moves to one side only:
-    so for a target that is met at rest, if ratio 1 is the upper bound.
+    `theta`, `solution` (as that of `equilibrium`), `value` and `loss` are differentiable in `target`, `bounds` and
+    every float of the scene, forward, reverse and to any order, by the conditions that an optimum satisfies (see
+    `jaxbeam.optimum`); not in `starts`. `history` is a record and does not move. The derivative is NaN where the status
+    is `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold it,
+    for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
 
     Raises:
         ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
@@ -247,7 +247,7 @@ def _reach_each(
 
 @partial(jax.jit, static_argnames=("measure", "solver"))
 def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
-    """The design as a function of the problem and the target: all but `history` and the whole numbers move with them."""
+    """The design as a function of the problem and the target. `history` and whole numbers do not move."""
     answer = Answer(
         theta=found.theta,
         x=found.solution.x,
@@ -264,7 +264,9 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
 
 @partial(jax.jit, static_argnames=("measure", "solver"))
 def _moving_each(problem: Problem, targets: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
-    return lax.map(lambda each: _moving(problem, *each, measure, solver), (targets, found))
+    # Factors are not kept, as in `differentiable_rows`.
+    each = jax.checkpoint(lambda row: _moving(problem, *row, measure, solver))
+    return lax.map(each, (targets, found))
 
 
 def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:

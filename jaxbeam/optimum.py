@@ -45,6 +45,7 @@ class Answer(NamedTuple):
     held: jax.Array
     reached: jax.Array
     trusted: jax.Array
+    factor: Any = None
 
 
 def move_answer(
@@ -52,10 +53,14 @@ def move_answer(
 ) -> tuple[jax.Array, Solution, jax.Array]:
     """Commands, solution and value of an answer as functions of the problem and the target."""
     # Equal bounds hold a command whatever it would gain without them.
-    answer = answer._replace(held=jnp.where(problem.low == problem.high, 1, answer.held))
+    held = jnp.where(problem.low == problem.high, 1, answer.held)
+    still = lax.stop_gradient(unlock(command(problem.scene, answer.theta)))
+    # XLA drops it where nothing is differentiated.
+    storage = assemble(problem.layout, stencil_hessians(still, answer.x))
+    answer = answer._replace(held=held, factor=solver.linear.factor(problem.layout, storage)[0])
     theta, _ = follow_optimum(measure, solver.linear, problem, jnp.ravel(target), answer)
     scene = command(problem.scene, theta)
-    moved = differentiable(unlock(scene), problem.layout, solution, None, solver)
+    moved = differentiable(unlock(scene), problem.layout, solution, answer.factor, solver)
     return theta, moved, measure(scene, moved.x)
 
 
@@ -65,21 +70,18 @@ def follow_optimum(
 ) -> tuple[jax.Array, jax.Array]:
     """`theta` `(m,)` of the answer itself and the multipliers `(p,)`, which move with the problem and the target
     `(p,)`. The tangents of the answer are ignored."""
-    slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer, None))(answer.theta)
+    slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
     slope = jnp.where(answer.held == 0, slope, 0)
     gram = slope @ slope.T
     price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ (1 - answer.theta))
     return answer.theta, jnp.where(answer.reached & answer.trusted, price, 0)
 
 
-def _outcome(
-    measure: Measure, linear: LinearSolver, problem: Problem, theta: jax.Array, answer: Answer, factor: Any
-) -> jax.Array:
+def _outcome(measure: Measure, linear: LinearSolver, problem: Problem, theta: jax.Array, answer: Answer) -> jax.Array:
     """The measure `(p,)` at commands `theta`."""
     scene = command(problem.scene, theta)
-    return jnp.ravel(
-        measure(scene, follow_scene(linear, unlock(scene), problem.layout, answer.x, factor, answer.trusted))
-    )
+    x = follow_scene(linear, unlock(scene), problem.layout, answer.x, answer.factor, answer.trusted)
+    return jnp.ravel(measure(scene, x))
 
 
 @follow_optimum.defjvp
@@ -92,16 +94,13 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     theta = jnp.where(answer.trusted, theta, answer.theta)
     price = jnp.where(answer.trusted, price, 0)
     at = jnp.concatenate([theta, price])
-    still = lax.stop_gradient(unlock(command(problem.scene, answer.theta)))
-    factor, _ = linear.factor(problem.layout, assemble(problem.layout, stencil_hessians(still, answer.x)))
-    factor = lax.stop_gradient(factor)
     held = jnp.append((answer.held != 0) & answer.trusted, jnp.zeros(p, bool))
     bound_dot = jnp.where(answer.held < 0, problem_dot.low, problem_dot.high)
     carried = jnp.where(held, jnp.append(bound_dot, jnp.zeros(p, theta.dtype)), 0)
 
     def lagrangian(problem: Problem, target: jax.Array, z: jax.Array) -> jax.Array:
         theta, price = z[:m], z[m:]
-        miss = _outcome(measure, linear, problem, theta, answer, factor) - target
+        miss = _outcome(measure, linear, problem, theta, answer) - target
         effort = 0.5 * jnp.sum((1 - theta) ** 2) + price @ miss
         return jnp.where(answer.reached, effort, 0.5 * jnp.sum(miss**2) + 0.5 * jnp.sum(price**2))
 
