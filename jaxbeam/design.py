@@ -23,6 +23,7 @@ from jaxbeam.equilibrium import equilibrium
 from jaxbeam.held import check_held
 from jaxbeam.measures import tip_angle
 from jaxbeam.newton import Newton, check_asked, topology
+from jaxbeam.optimum import Answer, move_answer
 from jaxbeam.scene import Scene, tendon_count
 from jaxbeam.search import History, Measure, Problem, Stand, effects, search
 from jaxbeam.solution import Solution
@@ -100,6 +101,12 @@ def reach(
         which bounds are in the way, or `NOT_CONVERGED`: also where no command has an effect on the measure, at the
         start and as they are shortened.
 
+    `theta`, `solution` (as that of `equilibrium`), `value` and `loss` are differentiable in `target`, `bounds` and
+    every float of the scene, forward, reverse and to any order, by the conditions that an optimum satisfies (see
+    `jaxbeam.optimum`); not in `starts`. `history` is a record and does not move. The derivative is NaN where the status
+    is `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold it,
+    for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
+
     Raises:
         ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
     """
@@ -108,7 +115,11 @@ def reach(
     goal = checks.numbers("target", target)
     if goal.shape != shape:
         raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
-    return _reach(problem, jnp.asarray(goal, scene.mesh.nodes.dtype), begin, measure, int(max_solves), solver)
+    goal, most = jnp.asarray(goal, scene.mesh.nodes.dtype), int(max_solves)
+    found = _reach(*lax.stop_gradient((problem, goal, begin)), measure, most, solver)
+    if is_concrete(*jax.tree.leaves((problem, goal))):
+        return found
+    return _moving(problem, goal, found, measure, solver)
 
 
 @usual_rules
@@ -126,7 +137,7 @@ def reach_each(
     """Commands for each of a sequence of targets `(T,)` or `(T, p)`, each started from the answer before.
 
     So a tip draws a path, in one `lax.scan`: neighbouring targets take few solves each. The first is found as by
-    `reach`. Arguments, errors and answer are those of `reach`, with leading axis `T`.
+    `reach`. Arguments, errors, answer and derivatives are those of `reach`, with leading axis `T`.
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
@@ -134,7 +145,11 @@ def reach_each(
     if goals.ndim != len(shape) + 1 or goals.shape[1:] != shape or not goals.shape[0]:
         rows = f"(T, {shape[0]})" if shape else "(T,)"
         raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
-    return _reach_each(problem, jnp.asarray(goals, scene.mesh.nodes.dtype), begin, measure, int(max_solves), solver)
+    goals, most = jnp.asarray(goals, scene.mesh.nodes.dtype), int(max_solves)
+    found = _reach_each(*lax.stop_gradient((problem, goals, begin)), measure, most, solver)
+    if is_concrete(*jax.tree.leaves((problem, goals))):
+        return found
+    return _moving_each(problem, goals, found, measure, solver)
 
 
 def _problem(
@@ -230,6 +245,30 @@ def _reach_each(
         return (found.theta, found.solution.x), found
 
     return lax.scan(following, (first.theta, first.solution.x), targets)[1]
+
+
+@partial(jax.jit, static_argnames=("measure", "solver"))
+def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
+    """The design as a function of the problem and the target. `history` and whole numbers do not move."""
+    answer = Answer(
+        theta=found.theta,
+        x=found.solution.x,
+        held=found.held,
+        reached=found.status == DesignStatus.REACHED,
+        trusted=(found.status != DesignStatus.NOT_CONVERGED) & (found.solution.status == 0),
+    )
+    theta, solution, value = move_answer(measure, solver, problem, target, answer, found.solution)
+    # The slope of the distance exists nowhere at zero, where it stays.
+    miss, away = jnp.ravel(value - target), found.loss != 0
+    loss = jnp.where(away, jnp.linalg.norm(jnp.where(away, miss, 1)), 0 * jnp.sum(miss))
+    return replace(found, theta=theta, solution=solution, value=value, loss=loss)
+
+
+@partial(jax.jit, static_argnames=("measure", "solver"))
+def _moving_each(problem: Problem, targets: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
+    # Factors are not kept, as in `differentiable_rows`.
+    each = jax.checkpoint(lambda row: _moving(problem, *row, measure, solver))
+    return lax.map(each, (targets, found))
 
 
 def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:

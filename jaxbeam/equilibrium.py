@@ -20,7 +20,7 @@ from jaxbeam._tree import Numbers, compiled, is_concrete, replace, unlock, usual
 from jaxbeam.dissection import Automatic
 from jaxbeam.follow import follow
 from jaxbeam.held import check_held
-from jaxbeam.implicit import follow_scene
+from jaxbeam.implicit import follow_scene, follow_zero, linear_gradient
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.newton import Newton, check_asked, check_linear, topology
 from jaxbeam.predictor import begin
@@ -89,22 +89,36 @@ def linear_response(scene: Scene, linear: LinearSolver = Automatic()) -> jax.Arr
     check_scene(scene)
     check_linear("linear", linear)
     check_held(scene)
-    x, stable = _linear_response(unlock(scene), linear.layout(topology(scene)), linear)
+    layout, open_scene = linear.layout(topology(scene)), unlock(scene)
+    x, stable, factor = _linear_response(*lax.stop_gradient((open_scene, layout)), linear)
     if is_concrete(stable) and not stable:
         raise ValueError(
             "scene: it is not stable at rest, its stiffness there is not positive definite, so no linear response "
             "exists; see lowest_mode(scene, scene.mesh.nodes), and solve it with equilibrium"
         )
-    return x
+    if is_concrete(*jax.tree.leaves(scene)):
+        return x
+    return _moving_response(open_scene, layout, x, stable, factor, linear)
 
 
 @compiled("linear")
-def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array]:
-    """The positions, and whether the stiffness at rest is positive definite: if not, its factor makes them NaN."""
+def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array, Any]:
+    """The positions, whether the stiffness at rest is positive definite, and its factor: if not, it makes them NaN."""
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
     step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
-    return rest - expand(layout, step, rest.shape), stable
+    return rest - expand(layout, step, rest.shape), stable, factor
+
+
+@partial(jax.jit, static_argnames="linear")
+def _moving_response(
+    scene: Scene, layout: Layout, x: jax.Array, stable: jax.Array, factor: Any, linear: LinearSolver
+) -> jax.Array:
+    """The linear response `x` as a function of the scene."""
+    # NaN is added at the end: in a slope it would spread to what does not look at it.
+    finite = jnp.where(stable, x, lax.stop_gradient(scene.mesh.nodes))
+    moving = follow_zero(linear, linear_gradient, scene, layout, finite, factor, stable)
+    return moving + jnp.where(stable | scene.fixed, 0, jnp.nan).astype(x.dtype)
 
 
 @compiled("solver")

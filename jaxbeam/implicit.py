@@ -27,6 +27,8 @@ from jaxbeam._rules import custom_derivative
 from jaxbeam.linear import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.scene import Scene, energy, stencil_hessians
 
+Gradient = Callable[[Scene, jax.Array], jax.Array]
+
 
 @lru_cache(maxsize=32)
 def _solve(linear: LinearSolver) -> Callable[[Layout, Any, jax.Array], jax.Array]:
@@ -45,7 +47,16 @@ def _solve(linear: LinearSolver) -> Callable[[Layout, Any, jax.Array], jax.Array
     return solve
 
 
-@partial(custom_derivative, static=1)
+energy_gradient = jax.grad(energy, argnums=1)
+
+
+def linear_gradient(scene: Scene, x: jax.Array) -> jax.Array:
+    """Gradient `(n, 2)` at `x` of the energy expanded to second order about rest."""
+    rest = scene.mesh.nodes
+    force, change = jax.jvp(partial(energy_gradient, scene), (rest,), (x - rest,))
+    return force + change
+
+
 def follow_scene(
     linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
 ) -> jax.Array:
@@ -59,24 +70,43 @@ def follow_scene(
         factor: of the true stiffness at `x`; None to make one if it is asked for.
         trusted: `()` whether `x` is an equilibrium with a definite stiffness.
     """
+    return follow_zero(linear, energy_gradient, scene, layout, x, factor, trusted)
+
+
+@partial(custom_derivative, static=2)
+def follow_zero(
+    linear: LinearSolver,
+    gradient: Gradient,
+    scene: Scene,
+    layout: Layout,
+    x: jax.Array,
+    factor: Any,
+    trusted: jax.Array,
+) -> jax.Array:
+    """`x` `(n, 2)` itself, which moves with the scene so that `gradient(scene, x)` stays zero where it is free.
+
+    `gradient` is `energy_gradient` or `linear_gradient`; otherwise as `follow_scene`. `factor` is that of its
+    derivative by `x`, and None only for the first.
+    """
     return x
 
 
-@follow_scene.defjvp
-def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+@follow_zero.defjvp
+def _follow_zero_jvp(
+    linear: LinearSolver, gradient: Gradient, primals: Any, tangents: Any
+) -> tuple[jax.Array, jax.Array]:
     scene, layout, found, factor, trusted = primals
     scene_dot = tangents[0]
-    x = follow_scene(linear, *primals)
+    x = follow_zero(linear, gradient, *primals)
     # The slope of a bad solution is NaN: kept out of second derivatives that do not look at it.
     at = jnp.where(trusted, x, found)
     if factor is None:
         factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(*lax.stop_gradient((scene, found)))))
     factor = lax.stop_gradient(factor)
-    slope = jax.grad(energy, argnums=1)
 
     def product(v: jax.Array) -> jax.Array:
         """The stiffness times a vector of unknowns."""
-        return gather(layout, jax.jvp(lambda y: slope(scene, y), (at,), (expand(layout, v, x.shape),))[1])
+        return gather(layout, jax.jvp(lambda y: gradient(scene, y), (at,), (expand(layout, v, x.shape),))[1])
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
         y = _solve(linear)(layout, factor, b)
@@ -84,6 +114,6 @@ def _follow_scene_jvp(linear: LinearSolver, primals: Any, tangents: Any) -> tupl
 
     # Fixed coordinates are at rest, and move with the rest positions.
     carried = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
-    pull = jax.jvp(slope, (scene, at), (scene_dot, carried))[1]
+    pull = jax.jvp(gradient, (scene, at), (scene_dot, carried))[1]
     moved = lax.custom_linear_solve(product, -gather(layout, pull), solve, symmetric=True)
     return x, expand(layout, moved, x.shape) + carried

@@ -601,3 +601,43 @@ def test_second_derivatives_of_a_ramped_rod(scene):
     ramped = jax.hessian(lambda r: tip(scene, jb.ramp(scene, r, 3, TIGHT).x[-1]))
     truth = jit(one)(jnp.asarray(BENT))
     np.testing.assert_allclose(jit(ramped)(jnp.asarray(BENT)), truth, rtol=0, atol=1e-9 * np.abs(truth).max())
+
+
+# ------------------------------------------------------------------------------------ the linear response
+
+
+def response(v):
+    """The tip angle by linear elasticity, at a command, with a Young's modulus, a length and a load."""
+    mesh = jb.rectangle(3.5 * v[3], 0.8, 3, 2)
+    pulls = jb.tendons(mesh, [[1, 3], [0, 2]], 2e3)
+    load = jb.dead_load(mesh, [5], 10 * jnp.stack([v[3], v[4]])[None])
+    terms = (jb.solid(mesh, jb.lame(1e4 * v[2], 0.4)), pulls, load)
+    scene = jb.command(jb.Scene(mesh, terms, jb.clamped(mesh, [0, 1]), np.array([4, 5])), v[:2])
+    return jb.tip_angle(scene, jb.linear_response(scene))
+
+
+def test_slopes_of_the_linear_response():
+    """To second order, plainly and inside `lax.map`; the value is that outside of any transformation."""
+    v = jnp.array([0.8, 1.0, 1.0, 1.0, 0.5])
+    mapped = lambda v: jax.lax.map(response, jnp.stack([v, 1.1 * v]))[0]
+    first, second = jit(jax.grad(response)), jit(jax.hessian(response))(v)
+    truth = differences_along(response, v)
+    np.testing.assert_allclose(jax.jvp(response, (v,), (jnp.ones(5),))[0], response(v), rtol=1e-12)
+    np.testing.assert_allclose(first(v), truth, rtol=0, atol=FIRST * np.abs(truth).max())
+    truth = differences_along(first, v)
+    np.testing.assert_allclose(second, truth, rtol=0, atol=SECOND * np.abs(truth).max())
+    np.testing.assert_allclose(jit(jax.jacrev(jax.jacrev(mapped)))(v), second, rtol=0, atol=1e-9 * np.abs(truth).max())
+
+
+def differences_along(f, v):
+    return np.stack([differences(lambda t, e=e: f(v + t * e), 1e-3) for e in np.eye(len(v))], axis=-1)
+
+
+def test_no_slope_of_a_linear_response_that_is_unstable():
+    """NaN, and under `vmap` its neighbours do not notice."""
+    place = lambda ratio: jb.linear_response(jb.command(PAIR, jnp.stack([ratio, 0.9 * ratio])))[2, 0]
+    both = jnp.array([0.9, 1.3])
+    np.testing.assert_array_equal(np.isnan(jit(jax.vmap(jax.value_and_grad(place)))(both)), [[False, True]] * 2)
+    shared = jit(jax.grad(lambda factor: jax.vmap(place)(factor * both)[0]))(1.0)
+    np.testing.assert_allclose(shared, 0.9 * jit(jax.grad(place))(0.9), rtol=1e-12)
+    assert np.isfinite(shared)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assembled, random_scene, shuffled, spring_pair, supports
+from helpers import assembled, central_difference, random_scene, shuffled, spring_pair, supports
 
 import jaxbeam as jb
 from jaxbeam._tree import Key
@@ -111,6 +111,49 @@ def test_mode_goes_through_vmap_and_jit(far):
         one = jb.lowest_mode(far, x, COUNT)
         np.testing.assert_allclose(together.values[k], one.values, rtol=1e-8, atol=1e-8)
         assert int(together.negative[k]) == int(one.negative)
+
+
+# ------------------------------------------------------------------------------------------ derivatives
+
+TINY = jb.tendon_beam(3, 2)
+DENSE = jb.Newton(rtol=1e-14, linear=jb.Dense())
+
+
+def bent_values(v):
+    """Two lowest eigenvalues at the equilibrium of a command, with a Young's modulus and a length."""
+    scene = jb.command(jb.tendon_beam(3, 2, young=1e4 * v[2], length=3.5 * v[3]), v[:2])
+    return jb.lowest_mode(scene, jb.equilibrium(scene, solver=DENSE).x, 2, DENSE).values
+
+
+def test_slopes_of_eigenvalues():
+    """By the scene, through the equilibrium, in both modes, against central differences of step 1e-4, whose truncation
+    is about 1e-8. The eigenvectors are accurate to about 1e-7."""
+    v = jnp.array([0.8, 1.0, 1.0, 1.0])
+    expected = central_difference(bent_values, v, 1e-4)
+    slope = jax.jacfwd(bent_values)(v)
+    np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(jax.jit(jax.jacrev(bent_values))(v), slope, rtol=1e-10, atol=1e-10 * np.abs(slope).max())
+    assert np.isnan(jax.hessian(lambda v: bent_values(v)[0])(v)).all()
+
+
+def test_slope_of_an_eigenvalue_by_positions():
+    """Positions that are fixed count too. Shapes have no derivative, and one that is not looked at harms nothing."""
+    x = jnp.asarray(crumpled(TINY, 0.05))
+    lowest = lambda x: jb.lowest_mode(TINY, x, solver=DENSE)
+    expected = central_difference(lambda x: lowest(jnp.asarray(x)).values[0], x, 1e-5)
+    slope = jax.grad(lambda x: lowest(x).values[0])(x)
+    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    mapped = jax.grad(lambda x: jax.lax.map(lambda x: lowest(x).values[0], jnp.stack([x, x]))[1])(x)
+    np.testing.assert_allclose(mapped, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
+    assert np.isnan(jax.grad(lambda x: lowest(x).shapes[0, -1, 1])(x)).all()
+    assert np.isnan(jax.jacfwd(lambda x: lowest(x).shapes[0, -1, 1])(x)).any()
+
+
+def test_slope_of_an_eigenvalue_in_closed_form():
+    """Two springs in line, `2 k (1 - ratio)` across and `2 k` along: at ratio 0 they are equal, and have no slope."""
+    value = lambda ratio: jb.lowest_mode(scene := spring_pair(ratio), scene.mesh.nodes).values[0]
+    assert float(jax.grad(value)(0.7)) == pytest.approx(-6, rel=1e-9)
+    assert np.isnan(jax.grad(value)(1e-14))
 
 
 def test_errors(far):
