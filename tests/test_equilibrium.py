@@ -370,6 +370,13 @@ def test_inverted_equilibrium_is_not_ok():
         jb.check(solution)
 
 
+def test_inverted_equilibrium_is_left_for_the_one_from_rest():
+    """It balances at once; with steps to spend, it is kept only if a shorter way leads there too."""
+    scene = triangle(jb.saint_venant_kirchhoff)
+    found = jb.check(jax.jit(lambda x0: jb.equilibrium(scene, x0))(TURNED_OVER))
+    np.testing.assert_allclose(found.x[2], [0, 1], atol=1e-9)
+
+
 def test_logarithm_stays_on_its_side():
     """Started inside out where that cannot be refused, it is recovered from rest; no step crosses J = 0."""
     solve = jax.jit(lambda x0, load: jb.equilibrium(triangle(jb.neo_hookean, load), x0))
