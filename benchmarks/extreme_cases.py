@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.mesh import middle_column
+from jaxbeam.mesh.rectangle import middle_column
 from tests.energies import Problem, Tendons
 from tests.helpers import scene_of
 

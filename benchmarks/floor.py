@@ -33,11 +33,11 @@ import numpy as np
 import jaxbeam as jb
 from benchmarks import reference, report, scaling
 from benchmarks.timing import medians
-from jaxbeam._tree import unlock
-from jaxbeam.chain import multiplications
-from jaxbeam.linear import Layout, assemble
-from jaxbeam.newton import topology
-from jaxbeam.scene import evaluate, stencil_hessians
+from jaxbeam.core.tree import unlock
+from jaxbeam.linear.blocks import multiplications
+from jaxbeam.linear.layout import Layout, assemble
+from jaxbeam.scene.scene import evaluate, stencil_hessians
+from jaxbeam.solve.newton import topology
 
 SIZES = (128, 256, 512, 1024, 2048)
 BATCH = 64

@@ -21,10 +21,10 @@ import numpy as np
 
 import jaxbeam as jb
 from benchmarks.timing import seconds
-from jaxbeam._tree import unlock
-from jaxbeam.linear import Layout, assemble
-from jaxbeam.newton import topology
-from jaxbeam.scene import stencil_hessians
+from jaxbeam.core.tree import unlock
+from jaxbeam.linear.layout import Layout, assemble
+from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.solve.newton import topology
 
 LINEAR = jb.BlockTridiagonal()
 factor, solve = jax.jit(LINEAR.factor), jax.jit(LINEAR.solve)

@@ -36,10 +36,10 @@ import numpy as np
 import jaxbeam as jb
 from benchmarks import report, sparse
 from benchmarks.timing import medians, seconds
-from jaxbeam._tree import unlock
-from jaxbeam.linear import assemble, expand, gather
-from jaxbeam.newton import topology
-from jaxbeam.scene import stencil_hessians
+from jaxbeam.core.tree import unlock
+from jaxbeam.linear.layout import assemble, expand, gather
+from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.solve.newton import topology
 
 MESHES = ((29, 7), (57, 13), (113, 25), (225, 49), (337, 73), (449, 97), (673, 149))
 ARC = 0.1

@@ -35,8 +35,8 @@ from scipy.sparse.linalg import splu
 import jaxbeam as jb
 from benchmarks import report
 from benchmarks.timing import medians
-from jaxbeam._tree import unlock
-from jaxbeam.scene import stencil_hessians
+from jaxbeam.core.tree import unlock
+from jaxbeam.scene.scene import stencil_hessians
 
 Matrix = scipy.sparse.csc_matrix
 

@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 
 import jaxbeam as jb
 from benchmarks.report import table, version
-from jaxbeam.elements import rule, shape_functions
+from jaxbeam.mesh.elements import rule, shape_functions
 
 # --------------------------------------------------------------------------------- what several items need
 

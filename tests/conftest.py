@@ -13,7 +13,7 @@ import jax
 import pytest
 
 import jaxbeam as jb
-from jaxbeam._tree import COMPILER_OPTIONS
+from jaxbeam.core.compiling import COMPILER_OPTIONS
 
 # Nearly all of the time here is compilation: what the library asks for its own programs is asked for all others as
 # well, and LLVM optimises none. XLA reads it when the first one is compiled. Benchmarks verify what is optimised.

@@ -13,8 +13,10 @@ import numpy as np
 from scipy.special import lambertw
 
 import jaxbeam as jb
-from jaxbeam.chain import Topology
-from jaxbeam.rod import Line, rod, rod_tendons
+from jaxbeam.linear.blocks import Topology
+from jaxbeam.mesh.line import Line
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
 from tests.energies import Problem
 
 EPS = np.finfo(np.float64).eps

@@ -7,7 +7,7 @@ import pytest
 from helpers import small_beam, spring_pair, traces
 
 import jaxbeam as jb
-from jaxbeam.scene import partway
+from jaxbeam.scene.scene import partway
 
 ROWS = np.array([[0.5, 1.0], [1.2, 0.8], [0.9, 0.7]])
 

@@ -9,8 +9,8 @@ import pytest
 from helpers import assembled, spring_pair
 
 import jaxbeam as jb
-from jaxbeam.newton import topology
-from jaxbeam.scene import evaluate, stencil_hessians
+from jaxbeam.scene.scene import evaluate, stencil_hessians
+from jaxbeam.solve.newton import topology
 
 END = np.array([0.3, 0.3])
 SADDLES = jb.Newton(escape=False)  # the setting that trace_branch starts with: compiled once

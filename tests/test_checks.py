@@ -10,9 +10,11 @@ import pytest
 from helpers import small_beam
 
 import jaxbeam as jb
-from jaxbeam.mesh import SLIVER
-from jaxbeam.rod import Line, rod, rod_tendons, straight
-from jaxbeam.scene import is_valid
+from jaxbeam.mesh.geometry import SLIVER
+from jaxbeam.mesh.line import Line, straight
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.scene.scene import is_valid
 
 MESH = jb.rectangle(2.0, 1.0, 3, 2)
 BODY = jb.solid(MESH, jb.lame(1.0, 0.3))
@@ -192,8 +194,6 @@ REFUSED = {
     "text to grade": (lambda: jb.tendon_beam(5, 3, graded="yes"), "graded: expected True or False, got 'yes'"),
     "true order": (lambda: jb.rectangle(1.0, 1.0, 3, 3, order=True), r"order: expected 1 .* got True"),
     "no diagonals": (lambda: jb.rectangle(1.0, 1.0, 3, 3, None), "diagonals: expected 'one-sided', .* got None"),
-    "true leaf": (lambda: jb.NestedDissection(leaf=True), "leaf: expected a whole number of at least 1, got True"),
-    "text to join": (lambda: jb.NestedDissection(join="no"), "join: expected True or False, got 'no'"),
     "true block": (lambda: jb.BlockTridiagonal(True), "joined: expected a whole number of at least 0, got True"),
     "true degree": (
         lambda: jb.tendon_beam(5, 3, degree=True),

@@ -11,8 +11,8 @@ import pytest
 from helpers import small_beam
 
 import jaxbeam as jb
-from jaxbeam._tree import replace
-from jaxbeam.terms import TendonEnergy
+from jaxbeam.core.tree import replace
+from jaxbeam.physics.tendon import TendonEnergy
 
 REACHED, UNREACHABLE, NOT_CONVERGED = jb.DesignStatus
 

@@ -7,8 +7,8 @@ import pytest
 from helpers import EPS, central_difference
 
 import jaxbeam as jb
-from jaxbeam.scene import is_valid
-from jaxbeam.stencils import admissible_step, smallest_ratios, volume_ratios
+from jaxbeam.physics.stencils import admissible_step, smallest_ratios, volume_ratios
+from jaxbeam.scene.scene import is_valid
 
 smallest = jax.jit(smallest_ratios)
 longest_step = jax.jit(admissible_step)

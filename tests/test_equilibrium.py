@@ -7,9 +7,9 @@ import pytest
 from helpers import PAIR_NODES, affine, forces, macneal_harder, reactions, small_beam, spring_pair, traces
 
 import jaxbeam as jb
-from jaxbeam._tree import unlock
-from jaxbeam.newton import newton, row_magnitudes, topology
-from jaxbeam.scene import stencil_hessians
+from jaxbeam.core.tree import unlock
+from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.solve.newton import newton, row_magnitudes, topology
 
 # Converged answers of two independent codes: ratios, tip angle in degrees and lengths of the tendons where known.
 REFERENCE = [

@@ -9,8 +9,8 @@ import pytest
 from helpers import run_python
 
 import jaxbeam as jb
-from jaxbeam.equilibrium import _equilibrium
-from jaxbeam.newton import topology
+from jaxbeam.solve.equilibrium import _equilibrium
+from jaxbeam.solve.newton import topology
 
 ANGLE = 0.01  # degrees, demanded of float32 against float64
 

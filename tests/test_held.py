@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.held import check_held
-from jaxbeam.rod import rod, rod_tendons, straight
+from jaxbeam.mesh.line import straight
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.scene.supports import check_held
 
 ROTATION = r"fixed: the body is not held, it moves rigidly without resistance: rotation about \(-1.75, -0.4\)"
 

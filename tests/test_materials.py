@@ -21,7 +21,7 @@ from helpers import (
 )
 
 import jaxbeam as jb
-from jaxbeam.materials import _less_log1p
+from jaxbeam.physics.materials import _less_log1p
 
 MU, LAM = 3.0, 7.0
 STRETCHES = [0.7, 0.95, 1.0, 1.4]

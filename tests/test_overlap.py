@@ -9,8 +9,8 @@ import pytest
 from helpers import annulus, l_shape, rotation
 
 import jaxbeam as jb
-from jaxbeam.anchors import surface
-from jaxbeam.overlap import crossing
+from jaxbeam.mesh.surface import surface
+from jaxbeam.scene.overlap import crossing
 
 crossed = jax.jit(crossing)
 

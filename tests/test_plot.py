@@ -20,8 +20,8 @@ from PIL import Image
 
 import jaxbeam as jb
 from jaxbeam import measures, plot
-from jaxbeam.anchors import patch, surface
-from jaxbeam.terms import Term
+from jaxbeam.mesh.surface import patch, surface
+from jaxbeam.physics.energy import Term
 
 STEPS = 5
 

@@ -8,9 +8,11 @@ from helpers import MATERIALS, central_difference, energy, forces, lateral_stret
 from scipy.special import ellipe, ellipk
 
 import jaxbeam as jb
-from jaxbeam.held import check_held
-from jaxbeam.rod import Line, fibre_energy, rod, rod_tendons, shear_modulus, straight
-from jaxbeam.scene import is_valid, smallest_jacobian
+from jaxbeam.mesh.line import Line, straight
+from jaxbeam.physics.rod import fibre_energy, rod, shear_modulus
+from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.scene.scene import is_valid, smallest_jacobian
+from jaxbeam.scene.supports import check_held
 
 smallest = jax.jit(smallest_jacobian)
 MU, LAM = 3.0, 7.0

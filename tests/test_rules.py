@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxbeam._rules import custom_derivative
+from jaxbeam.core.derivative import custom_derivative
 
 
 @functools.partial(custom_derivative, static=1)

@@ -9,7 +9,7 @@ import pytest
 from helpers import affine, energy, forces, reactions, rotation, run_python, small_beam, spring_pair
 
 import jaxbeam as jb
-from jaxbeam._tree import replace
+from jaxbeam.core.tree import replace
 
 UNIT = jb.rectangle(2.0, 1.0, 3, 2)
 BODY = jb.solid(UNIT, jb.lame(10.0, 0.3))

@@ -9,11 +9,11 @@ import pytest
 from helpers import assembled, central_difference, random_scene, shuffled, spring_pair, supports
 
 import jaxbeam as jb
-from jaxbeam._tree import Key
-from jaxbeam.chain import Topology
-from jaxbeam.linear import assemble, expand, gather
-from jaxbeam.newton import topology
-from jaxbeam.scene import stencil_hessians
+from jaxbeam.core.tree import Key
+from jaxbeam.linear.blocks import Topology
+from jaxbeam.linear.layout import assemble, expand, gather
+from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.solve.newton import topology
 
 LONG = jb.rectangle(4.0, 1.0, 9, 3)
 SHUFFLED, NUMBER = shuffled(LONG)

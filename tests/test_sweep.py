@@ -12,11 +12,13 @@ import pytest
 from helpers import small_beam, traces
 
 import jaxbeam as jb
-from jaxbeam.predictor import ahead, begin, extend
-from jaxbeam.rod import rod, rod_tendons, straight
+from jaxbeam.mesh.line import straight
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.solve.predictor import ahead, begin, extend
 
 # The package's name `sweep` is the function; its module is found through it.
-module = sys.modules["jaxbeam.sweep"]
+module = sys.modules["jaxbeam.solve.sweep"]
 LINE = np.stack([1 + np.linspace(-0.3, 0.3, 25), 1 - np.linspace(-0.3, 0.3, 25)], axis=1)
 
 

@@ -20,8 +20,8 @@ from helpers import (
 from jax.flatten_util import ravel_pytree
 
 import jaxbeam as jb
-from jaxbeam.stencils import admissible_step, volume_ratios
-from jaxbeam.terms import displacement_gradients
+from jaxbeam.physics.solid import displacement_gradients
+from jaxbeam.physics.stencils import admissible_step, volume_ratios
 
 MESHES = {
     "rectangle": disturbed(jb.rectangle(2.0, 1.0, 5, 4)),

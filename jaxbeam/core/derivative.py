@@ -1,0 +1,115 @@
+"""Functions with a derivative rule of their own, to any order and under every transformation.
+
+`jax.custom_jvp` is not enough for a rule that calls its own function again, as that of an implicit function does. Where
+JAX partially evaluates the body of a scan (in reverse mode under `lax.map`, `lax.scan` or `jax.checkpoint`) it keeps
+what the rule computes and drops the rule itself. What the rule calls again is then differentiated as it is written, and
+second derivatives are wrong without a word. A primitive keeps its rule.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jaxbeam.core.compiling import usual_rules
+
+T = TypeVar("T")
+
+
+Axes = tuple[tuple[int | None, ...], ...]
+
+
+class custom_derivative(Generic[T]):
+    """Decorator: a function of pytrees of arrays whose derivative is what `defjvp` says, like `jax.custom_jvp`.
+
+    Args:
+        function: of `static` hashable arguments, which come first, and then of pytrees of arrays.
+        static: how many of the arguments are hashable values and no arrays.
+    """
+
+    def __init__(self, function: Callable[..., T], static: int = 0) -> None:
+        functools.update_wrapper(self, function)
+        self.function, self.static = function, static
+        self.rule: Callable[..., tuple[T, T]] | None = None
+        self.primitive = Primitive(function.__name__.strip("_"))
+        self.primitive.multiple_results = True
+        self.primitive.def_impl(lambda *leaves, **how: jax.jit(self._values(**how))(*leaves))
+        self.primitive.def_abstract_eval(self._shapes)
+        mlir.register_lowering(
+            self.primitive,
+            mlir.lower_fun(lambda *leaves, **how: self._values(**how)(*leaves), multiple_results=True),
+        )
+        ad.primitive_jvps[self.primitive] = self._differentiated
+        batching.primitive_batchers[self.primitive] = self._batched
+
+    def defjvp(self, rule: Callable[..., tuple[T, T]]) -> Callable[..., tuple[T, T]]:
+        """Set the rule: of the static arguments, a tuple of the others and a tuple of their tangents, to the value and
+        its tangent. Tangents of whole numbers and booleans are of dtype `float0`."""
+        self.rule = rule
+        return rule
+
+    def __call__(self, *arguments: Any) -> T:
+        static, arrays = arguments[: self.static], arguments[self.static :]
+        leaves, tree = jax.tree.flatten(arrays)
+        shape = jax.tree.structure(jax.eval_shape(functools.partial(self.function, *static), *arrays))
+        found = self.primitive.bind(*(jnp.asarray(leaf) for leaf in leaves), static=static, tree=tree, axes=())
+        return jax.tree.unflatten(shape, found)
+
+    def _values(self, static: tuple[Any, ...], tree: Any, axes: Axes) -> Callable[..., list[jax.Array]]:
+        """The function from leaves to leaves, mapped over each of the batch `axes`."""
+
+        @usual_rules
+        def flat(*leaves: jax.Array) -> list[jax.Array]:
+            return jax.tree.leaves(self.function(*static, *jax.tree.unflatten(tree, leaves)))
+
+        return _mapped(flat, axes)
+
+    def _shapes(self, *avals: Any, **how: Any) -> list[Any]:
+        return jax.make_jaxpr(self._values(**how))(*avals).out_avals
+
+    def _differentiated(
+        self, primals: Sequence[Any], tangents: Sequence[Any], static: tuple[Any, ...], tree: Any, axes: Axes
+    ) -> tuple[list[Any], list[Any]]:
+        moving = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
+        count = len(primals)
+
+        @usual_rules
+        def both(*leaves: jax.Array) -> list[jax.Array]:
+            values, moved = leaves[:count], [_still(leaf) for leaf in leaves[:count]]
+            for k, tangent in zip(moving, leaves[count:], strict=True):
+                moved[k] = tangent
+            unflatten = functools.partial(jax.tree.unflatten, tree)
+            assert self.rule is not None
+            value, change = self.rule(*static, unflatten(values), unflatten(moved))
+            return [*jax.tree.leaves(value), *jax.tree.leaves(change)]
+
+        along = tuple((*level, *(level[k] for k in moving)) for level in axes)
+        found = _mapped(both, along)(*primals, *(tangents[k] for k in moving))
+        return found[: len(found) // 2], found[len(found) // 2 :]
+
+    def _batched(
+        self, leaves: Sequence[Any], dims: Sequence[Any], static: tuple[Any, ...], tree: Any, axes: Axes
+    ) -> tuple[list[Any], list[int]]:
+        level = tuple(dim if isinstance(dim, int) else None for dim in dims)
+        found = self.primitive.bind(*leaves, static=static, tree=tree, axes=(*axes, level))
+        return found, [0] * len(found)
+
+
+def _mapped(function: Callable[..., T], axes: Axes) -> Callable[..., T]:
+    """A function of leaves, mapped by `jax.vmap` once for each level of batch axes, the first of them innermost."""
+    for level in axes:
+        function = jax.vmap(function, in_axes=level)
+    return function
+
+
+def _still(leaf: jax.Array) -> Any:
+    """The tangent of what does not move."""
+    floating = jnp.issubdtype(leaf.dtype, jnp.inexact)
+    return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)

@@ -1,0 +1,1 @@
+"""Bodies at rest: elements, meshes of triangles, lines of rods, refinement, surfaces."""

@@ -1,0 +1,193 @@
+"""Checks of a mesh of triangles: what joins what, areas, curved edges, overlaps. All on the host."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxbeam.mesh.bernstein import minimiser, value
+from jaxbeam.mesh.elements import EDGES, corner_slopes, determinants, is_affine
+
+# A triangle of no more area than this share of the square of the body's extent has none.
+SLIVER = 1e-14
+
+
+def _check_topology(count: int, elements: np.ndarray) -> None:
+    outside = np.flatnonzero(((elements < 0) | (elements >= count)).any(axis=1))
+    if outside.size:
+        k = outside[0]
+        raise ValueError(f"elements: triangle {k} is {elements[k].tolist()}, but nodes are numbered 0 to {count - 1}")
+    ordered = np.sort(elements, axis=1)
+    repeated = np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))
+    if repeated.size:
+        k = repeated[0]
+        raise ValueError(f"elements: triangle {k} repeats a node: {elements[k].tolist()}; remove it")
+    used = np.zeros(count, bool)
+    used[elements] = True
+    if not used.all():
+        unused = np.flatnonzero(~used)
+        raise ValueError(
+            f"nodes: {unused.size} belong to no triangle, the first is node {unused[0]}; remove them and renumber"
+        )
+
+
+def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
+    if not np.isfinite(nodes).all():
+        k = np.flatnonzero(~np.isfinite(nodes).all(axis=1))[0]
+        raise ValueError(f"nodes: node {k} is not finite: {nodes[k].tolist()}")
+    extent = np.ptp(nodes, axis=0).max()
+    # Merging nodes closer than this is what mesh generators do; a real gap is far wider.
+    grid = np.round(nodes / (1e-9 * extent if extent > 0 else 1.0))
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.ravel()]
+    copies = np.flatnonzero(original != np.arange(len(nodes)))
+    if copies.size:
+        k = copies[0]
+        raise ValueError(
+            f"nodes: nodes {original[k]} and {k} coincide at {nodes[k].tolist()}; merge them, or the body is torn there"
+        )
+    area = _areas(nodes, elements)
+    bad = np.flatnonzero(area <= SLIVER * extent**2)
+    if bad.size:
+        k = bad[0]
+        cure = "list its corners counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
+        raise ValueError(
+            f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
+            f" ({bad.size} such triangles)"
+        )
+    if not is_affine(elements.shape[1]):
+        _check_curves(nodes, elements, area)
+
+
+def _areas(nodes: Any, elements: np.ndarray) -> Any:
+    """Signed area `(t,)` of each triangle between its corners."""
+    a, b, c = (nodes[elements[:, k]] for k in range(3))
+    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+def _check_curves(nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
+    """Refuse triangles of six nodes that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
+    slopes = corner_slopes(np.moveaxis(nodes[elements], 0, -1))
+    stretch = np.stack(determinants(slopes, slopes)) / (2 * area)
+    place = minimiser(stretch)
+    least = value(stretch, place)
+    bad = np.flatnonzero(least <= 1e-12)
+    if bad.size:
+        k = bad[0]
+        where = ", ".join(f"{coordinate:.3g}" for coordinate in place[:, k])
+        raise ValueError(
+            f"elements: triangle {k}, {elements[k].tolist()}, folds over: its edges are curved so much that the "
+            f"determinant of its map is {least[k]:.3g} times that of the straight triangle at barycentric coordinates "
+            f"({where}), expected positive; move its nodes 3 to 5 towards the middles of its edges ({bad.size} such "
+            f"triangles)"
+        )
+
+
+# ----------------------------------------------------------------------------------------------- overlaps
+
+
+def _surface_of(elements: np.ndarray) -> np.ndarray:
+    """Edges `(b, 2)` of the surface, the body on their left, after a check of all edges.
+
+    Raises:
+        ValueError: if two triangles lie on the same side of an edge: if each is counter-clockwise, an edge runs one way
+            in one of its triangles and the other way in the other.
+    """
+    a, b = elements[:, EDGES].reshape(-1, 2).T.astype(np.int64)
+    total = int(elements.max()) + 1
+    # One number tells both ends of a side and its direction; those of one edge are neighbours when sorted.
+    sides = np.sort((np.minimum(a, b) * total + np.maximum(a, b)) * 2 + (a > b))
+    edge = sides >> 1
+    twice = np.flatnonzero(sides[1:] == sides[:-1])
+    if twice.size:
+        ends = divmod(int(edge[twice[0]]), total)
+        those = np.flatnonzero(np.isin(elements[:, :3], ends).sum(axis=1) == 2)
+        corners = np.sort(elements[those, :3], axis=1)
+        if len(np.unique(corners, axis=0)) < len(those):
+            k = those[0]
+            raise ValueError(
+                f"elements: triangle {k}, {elements[k].tolist()}, is listed more than once; remove the copies"
+            )
+        raise ValueError(
+            f"elements: triangles {those.tolist()} meet in the edge between nodes {ends[0]} and {ends[1]}, and two of "
+            f"them lie on the same side of it; triangles must not overlap"
+        )
+    shared = np.append(edge[1:] == edge[:-1], False)
+    alone = ~(shared | np.roll(shared, 1))
+    low, high = np.divmod(edge[alone], total)
+    turned = (sides[alone] & 1).astype(bool)
+    return np.stack([np.where(turned, high, low), np.where(turned, low, high)], axis=1)
+
+
+def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) -> None:
+    """Refuse triangles that overlap, from the surface `edges` alone, of triangles that are counter-clockwise.
+
+    So many triangles lie over a point as the surface winds round it. That number changes only across the surface: it is
+    at most 1 if no two edges of the surface cross, and it is 1 beside each of them.
+    """
+    # Measured from one of its nodes, wherever the body lies.
+    begin, end = (nodes[edges[:, k]] - nodes[edges[0, 0]] for k in (0, 1))
+    extent = np.ptp(begin, axis=0)
+    if elements.shape[1] == 6:
+        bulge = nodes[elements[:, 3:]] - nodes[elements[:, EDGES]].mean(axis=2)
+        if np.abs(bulge).max() > 1e-9 * extent.max():
+            return
+    first, second = _crossing(begin, end, int(np.argmax(extent)))
+    if first.size:
+        here, there = edges[first[0]].tolist(), edges[second[0]].tolist()
+        raise ValueError(
+            f"elements: triangles overlap: the edge between nodes {here[0]} and {here[1]} of the surface crosses that "
+            f"between nodes {there[0]} and {there[1]}"
+        )
+    covered = np.flatnonzero(_windings(begin, end) > 1)
+    if covered.size:
+        a, b = edges[covered[0]].tolist()
+        raise ValueError(f"elements: triangles overlap: others lie over that at the edge between nodes {a} and {b}")
+
+
+def _crossing(begin: np.ndarray, end: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of edges, as numbers of the first and of the second, that cross each other between their ends."""
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    order = np.argsort(low[:, axis])
+    last = np.searchsorted(low[order, axis], high[order, axis])
+    i, j = (order[k] for k in _ranges(np.arange(1, len(order) + 1), last))
+    near = (low[i, 1 - axis] < high[j, 1 - axis]) & (low[j, 1 - axis] < high[i, 1 - axis])
+    i, j = i[near], j[near]
+    # What is no more than round-off counts as touching.
+    noise = 1e-12 * np.abs(end).max()
+
+    def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        along = end[one] - begin[one]
+        least = noise * np.linalg.norm(along, axis=1)
+        sides = [_cross(along, point[other] - begin[one]) for point in (begin, end)]
+        return (np.minimum(*sides) < -least) & (np.maximum(*sides) > least)
+
+    crossed = apart(i, j) & apart(j, i)
+    return i[crossed], j[crossed]
+
+
+def _windings(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """How often the edges wind round the point just left of the middle of each."""
+    along = end - begin
+    point = (begin + end) / 2 + 1e-6 * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    order = np.argsort(point[:, 1])
+    heights = point[order, 1]
+    first, last = (np.searchsorted(heights, of(begin[:, 1], end[:, 1])) for of in (np.minimum, np.maximum))
+    edge, k = _ranges(first, last)
+    beside = order[k]
+    side = np.sign(_cross(along[edge], point[beside] - begin[edge]))
+    # A ray to the right of the point meets the edges on that side: upward ones, or downward ones.
+    up = np.sign(along[edge, 1])
+    return np.bincount(beside, up * (side == up), minlength=len(begin))
+
+
+def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs `(i, k)` with `first[i] <= k < last[i]`."""
+    lengths = np.maximum(last - first, 0)
+    i = np.repeat(np.arange(len(first)), lengths)
+    return i, np.arange(len(i)) + np.repeat(first - np.cumsum(lengths) + lengths, lengths)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,0 +1,147 @@
+"""Triangle meshes: rest positions of the nodes and the triangles that join them.
+
+Triangles have three nodes (P1) or six (P2, in the order of `jaxbeam.mesh.elements`) and are counter-clockwise. Lengths
+are in the user's unit. Everything is checked here, on the host, once; what follows trusts a `Mesh`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.tree import Numbers, index_field, is_concrete, pytree, to_device
+from jaxbeam.mesh.elements import EDGES
+from jaxbeam.mesh.geometry import SLIVER, _areas, _check_geometry, _check_overlaps, _check_topology, _surface_of
+
+
+@pytree
+class Mesh:
+    """Nodes and triangles of a body at rest.
+
+    Args:
+        nodes: `(n, 2)` rest positions, in the user's length unit. Their dtype is the dtype of every
+            computation on the mesh. May be traced: shape is differentiable.
+        elements: `(t, 3)` or `(t, 6)` node numbers of each triangle: its corners, counter-clockwise, and then the
+            nodes between corners 0 and 1, 1 and 2, 2 and 0. Always concrete.
+
+    Raises:
+        ValueError: if a shape or dtype is wrong, an index is out of range, a triangle repeats a node, is
+            listed twice, is inverted somewhere or has no area, a node is unused, two nodes coincide, a
+            coordinate is not finite, or two triangles overlap. Where edges are curved, overlaps are found only
+            between triangles that share an edge. While `nodes` is traced, a node that is not finite and a triangle that
+            is inverted or has no area make it NaN, and whatever is solved on it `INVALID`; nodes that coincide and
+            triangles that overlap without sharing an edge are not looked for.
+    """
+
+    nodes: jax.Array
+    elements: np.ndarray = index_field()
+
+    def __post_init__(self) -> None:
+        elements = checks.whole_numbers("elements", self.elements, "(t, 3) or (t, 6)", (3, 6))
+        nodes = float_nodes(self.nodes, 2, "(x, y)")
+        _check_topology(nodes.shape[0], elements)
+        if is_concrete(nodes):
+            positions = np.asarray(nodes, dtype=np.float64)
+            _check_geometry(positions, elements)
+            _check_overlaps(positions, elements, _surface_of(elements))
+        else:
+            _surface_of(elements)
+            upright = _areas(nodes, elements) > SLIVER * jnp.max(jnp.ptp(nodes, axis=0)) ** 2
+            nodes = checks.poisoned(nodes, jnp.all(upright))
+        object.__setattr__(self, "nodes", to_device(nodes))
+        object.__setattr__(self, "elements", elements)
+
+
+def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
+    """Corner nodes, in the order given, and the nodes that lie between two of them."""
+    among = np.isin(mesh.elements[:, :3], corners)
+    found = (
+        [mesh.elements[among[:, a] & among[:, b], 3 + k] for k, (a, b) in enumerate(EDGES)]
+        if mesh.elements.shape[1] == 6
+        else []
+    )
+    return np.concatenate([corners, np.unique(np.concatenate([*found, np.zeros(0, int)]))]).astype(int)
+
+
+def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Numbers of the nodes whose rest position satisfies `predicate(x, y)`, in increasing order.
+
+    Args:
+        mesh: with concrete nodes.
+        predicate: takes the `(n,)` coordinates and returns `(n,)` booleans.
+
+    Raises:
+        ValueError: if the predicate returns another shape or selects nothing, or the nodes are traced.
+
+    >>> left = nodes_where(rectangle(2.0, 1.0, 3, 2), lambda x, y: x < -0.99)
+    >>> [int(i) for i in left]
+    [0, 1]
+    """
+    checks.function("predicate", predicate, "(x, y) -> booleans")
+    x, y = _concrete_nodes(mesh).T
+    mask = np.asarray(predicate(x, y))
+    if mask.shape != x.shape or mask.dtype != bool:
+        raise ValueError(f"predicate: expected {x.shape} booleans, got shape {mask.shape} of dtype {mask.dtype}")
+    if not mask.any():
+        raise ValueError(
+            f"predicate: selects no node; x spans [{x.min():g}, {x.max():g}], y spans [{y.min():g}, {y.max():g}]"
+        )
+    return np.flatnonzero(mask)
+
+
+def nearest_node(mesh: Mesh, point: Numbers) -> int:
+    """Number of the node nearest to `point` `(2,)` at rest (the lowest number among equals).
+
+    Raises:
+        ValueError: if the point is not two finite numbers, or the nodes are traced.
+    """
+    if not is_concrete(point):
+        raise ValueError("point: expected two known coordinates, got traced ones; select nodes outside jit and grad")
+    target = checks.numbers("point", point, shapes=((2,),))
+    return int(np.argmin(np.sum((_concrete_nodes(mesh) - target) ** 2, axis=1)))
+
+
+def pieces(elements: np.ndarray, count: int) -> np.ndarray:
+    """`(n,)` number, from 0, of the connected piece that each of `count` nodes belongs to."""
+    label = np.arange(count)
+    while True:
+        lowest = label[elements].min(axis=1)
+        lower = label.copy()
+        np.minimum.at(lower, elements, lowest[:, None])
+        lower = lower[lower]
+        if (lower == label).all():
+            return np.unique(label, return_inverse=True)[1].ravel()
+        label = lower
+
+
+def _concrete_nodes(mesh: Mesh) -> np.ndarray:
+    checks.instance("mesh", mesh, Mesh, "a scene has it as scene.mesh")
+    if not is_concrete(mesh.nodes):
+        raise ValueError(
+            "mesh: its nodes are traced, so nodes cannot be selected by position; select before jit or grad"
+        )
+    return np.asarray(mesh.nodes, dtype=np.float64)
+
+
+def check_triangles(mesh: Mesh) -> None:
+    """Refuse what is not a mesh of triangles."""
+    checks.instance("mesh", mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)")
+    if mesh.elements.shape[1] == 2:
+        raise ValueError("mesh: expected triangles, got the Line of a rod, whose body is rod(line, height, params)")
+
+
+def float_nodes(value: Any, columns: int, row: str) -> Any:
+    """Rest positions `(n, columns)` as floats, each `row` of them; JAX arrays as they are."""
+    array = checks.real("nodes", value)
+    if array.dtype.kind != "f":
+        if isinstance(value, jax.Array):
+            raise ValueError(f"nodes: expected floats, got dtype {array.dtype}; convert them with .astype(float)")
+        array = array.astype(float)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise ValueError(f"nodes: expected shape (n, {columns}), got {array.shape}; give one {row} row for each node")
+    return value if isinstance(value, jax.Array) else array

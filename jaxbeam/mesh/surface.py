@@ -1,0 +1,101 @@
+"""Where a tendon is attached to a body: at a node, or over a patch of the surface.
+
+A force on one node is a point load, under which the displacement of a continuum is infinite: the answer drifts without
+end as the mesh is refined. A patch of finite width has a limit. Its position is the mean of the surface, weighted by a
+tent of the arc length `s` from the anchor,
+
+    p = int w(s) x(s) ds / int w(s) ds,     w = max(0, 1 - |s| / width),
+
+with `x(s)` as the shape functions have it, so that it is a weighted mean of nodes whose weights add up to 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+
+from jaxbeam.core.tree import Key, is_concrete, key_of, read_only
+from jaxbeam.mesh.elements import EDGES
+from jaxbeam.mesh.mesh import Mesh
+
+# Gauss's rule of two points on (0, 1): exact for a shape function times the tent.
+_POINTS = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
+
+
+def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes `(k,)` of the surface within `width` of a corner node of it, the node itself first, and weights `(k,)`.
+
+    Arc length is measured along edges taken as straight, round corners of the body too. With a width of 0 it is the
+    node alone.
+
+    Raises:
+        ValueError: if the nodes are traced, the node is not a corner of a triangle on the surface, or the surface
+            within `width` closes on itself.
+    """
+    if width == 0:
+        return np.array([node]), np.ones(1)
+    if not is_concrete(mesh.nodes):
+        raise ValueError("width: an anchor of finite width needs concrete nodes; build the mesh outside jit and grad")
+    positions = np.asarray(mesh.nodes, float)
+    weights = {node: 0.0}
+    for line, s, length, share in walk(positions, surface(mesh), node, width):
+        xi = share * _POINTS
+        tent = 0.5 * share * length * (1 - (s + length * xi) / width)
+        for number, values in zip(line, _line_functions(len(line), xi), strict=True):
+            weights[number] = weights.get(number, 0.0) + float(tent @ values)
+    nodes, values = np.array(list(weights)), np.array(list(weights.values()))
+    return nodes, values / values.sum()
+
+
+def walk(
+    positions: np.ndarray, edges: np.ndarray, node: int, width: float
+) -> Iterator[tuple[list[int], float, float, float]]:
+    """The edges of a surface within `width` of a node, first one way round the body and then the other.
+
+    Yields:
+        The edge in the direction of the walk; the arc length at its beginning; its length; and the share of it, from
+        its beginning, that lies within `width`.
+
+    Raises:
+        ValueError: if the node is not a corner on the surface, or the surface closes on itself within `width`.
+    """
+    for ways in (edges, edges[:, [1, 0, 2][: edges.shape[1]]]):
+        following = {line[0]: line for line in ways.tolist()}
+        here, s, left = node, 0.0, len(ways)
+        while s < (1 - 1e-9) * width:
+            # Where two parts of a body touch at a node, the way may lead round the other part for ever.
+            if here not in following or (s > 0 and here == node) or left == 0:
+                problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
+                raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
+            line = following[here]
+            length = float(np.linalg.norm(positions[line[1]] - positions[line[0]]))
+            yield line, s, length, min(1.0, (width - s) / length)
+            here, s, left = line[1], s + length, left - 1
+
+
+def surface(mesh: Mesh) -> np.ndarray:
+    """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
+    body, and the node between them if there is one."""
+    return surface_of((key_of(mesh, "elements"),))
+
+
+@lru_cache(maxsize=32)
+def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
+    """The edges of the surface, as `surface` gives them, of triangles `(t, k)`; none of no triangles."""
+    if not bodies:
+        return read_only(np.zeros((0, 2)), np.int32)
+    triangles = np.concatenate([body.array for body in bodies])
+    sides = [[triangles[:, a], triangles[:, b], *triangles.T[3 + k :][:1]] for k, (a, b) in enumerate(EDGES)]
+    every = np.stack([np.stack(side, axis=1) for side in sides], axis=1).reshape(-1, 2 + (triangles.shape[1] == 6))
+    low, high = np.sort(every[:, :2].astype(np.int64), axis=1).T
+    _, number, count = np.unique(low * (triangles.max() + 1) + high, return_inverse=True, return_counts=True)
+    return read_only(every[count[number] == 1])
+
+
+def _line_functions(nodes: int, xi: np.ndarray) -> list[np.ndarray]:
+    """The shape functions of an edge, at `xi` from its first corner (0) to its second (1)."""
+    if nodes == 2:
+        return [1 - xi, xi]
+    return [(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)]

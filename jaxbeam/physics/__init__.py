@@ -1,0 +1,1 @@
+"""Energies: the contract, materials, and one file for each kind."""

@@ -1,0 +1,72 @@
+"""Tendons beside the axis of a rod."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace
+from jaxbeam.mesh.line import Line
+from jaxbeam.physics.energy import Term
+from jaxbeam.physics.tendon import TendonEnergy, inverse_square_stiffness, polyline_length, tendons
+
+# -------------------------------------------------------------------------------------------- tendons
+
+
+@pytree
+class Offsets:
+    """Where the points of tendons are: `eccentricity` `(m, k)` along the section from its node, to the left of the
+    axis, and `radian` `(m,)` as in `Line`."""
+
+    eccentricity: jax.Array
+    radian: jax.Array
+
+
+def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
+    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`: `(x - e sin theta, y + e cos theta)`."""
+    xp = namespace(x, attachment.eccentricity, attachment.radian)
+    theta = x[..., 2] / attachment.radian[..., None]
+    normal = xp.stack([-xp.sin(theta), xp.cos(theta)], axis=-1)
+    return x[..., :2] + attachment.eccentricity[..., None] * normal
+
+
+@usual_rules
+def rod_tendons(
+    line: Line,
+    nodes: Numbers,
+    eccentricity: Numbers,
+    modulus: Numbers,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+) -> Term:
+    """Tendons beside the axis of a rod, at their natural length (ratio 1); `command` shortens them.
+
+    Args:
+        line: natural lengths are measured on its rest positions, and differentiable in them.
+        nodes: `(m, k)` node numbers: of the two ends of each tendon, with any guides between.
+        eccentricity: distance of each point from its node, to the left of the axis; scalar or `(m, k)`; differentiable.
+        modulus: as for `tendons`.
+        stiffness: as for `tendons`.
+
+    Raises:
+        ValueError: if `eccentricity` has another shape or is not finite, or as `tendons` does.
+    """
+    # It checks the nodes and the modulus. Lengths are measured anew.
+    checks.instance("line", line, Line, "on a mesh of triangles use tendons")
+    plain = tendons(line, nodes, modulus, stiffness)
+    eccentricity = checks.numbers(
+        "eccentricity", eccentricity, shapes=((), plain.nodes.shape), each="one for each point"
+    )
+    dtype, xp = line.nodes.dtype, namespace(line.nodes, line.radian, eccentricity)
+    offsets = Offsets(
+        xp.broadcast_to(xp.asarray(eccentricity, dtype), plain.nodes.shape),
+        xp.broadcast_to(xp.asarray(line.radian), plain.nodes.shape[:1]),
+    )
+    natural = polyline_length(at_offsets(xp.asarray(line.nodes)[plain.nodes], offsets))
+    return Term(
+        TendonEnergy(stiffness, at_offsets),
+        plain.nodes,
+        replace(plain.params, natural=natural, commanded=natural, attachment=offsets),
+    )

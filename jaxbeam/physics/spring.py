@@ -1,0 +1,40 @@
+"""Springs from nodes to their rest positions."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.physics.energy import Term, check_nodes
+from jaxbeam.physics.load import PointParams
+
+
+def penalty_energy(x: jax.Array, params: PointParams) -> jax.Array:
+    """`1/2 k |x - X|^2`: a spring from one node to its rest position."""
+    return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
+
+
+@usual_rules
+def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
+    """Springs that hold nodes near their rest positions: a soft clamp.
+
+    A clamp in `Scene.fixed` is exact and cheaper. This one, at the usual 1e9, shifts the reference angle
+    by 2e-6 degrees and rules out float32; it is here for comparison with codes that clamp so.
+
+    Args:
+        mesh: gives the rest positions.
+        nodes: `(m,)` node numbers.
+        stiffness: force per length, not negative; scalar or `(m,)`; differentiable.
+
+    Raises:
+        ValueError: if a node is out of range, or `stiffness` has another shape or is negative or not finite.
+    """
+    where = check_nodes("nodes", mesh, nodes, ndim=1)
+    stiffness = checks.numbers("stiffness", stiffness, checks.NOT_NEGATIVE, ((), (where.size,)))
+    xp, rest = namespace(stiffness), namespace(mesh.nodes).asarray(mesh.nodes)[where]
+    values = xp.broadcast_to(xp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
+    return Term(penalty_energy, where[:, None], PointParams(rest, values))

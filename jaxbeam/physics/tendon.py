@@ -1,0 +1,178 @@
+"""Tendons: springs along a line through points of a body, commanded by their rest length.
+
+A tendon's tension is positive when it pulls its ends together. These tendons are two-way: one that is longer than its
+ends are apart pushes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.surface import patch
+from jaxbeam.physics.energy import Term, check_nodes
+
+# -------------------------------------------------------------------------------------------- tendons
+
+
+@pytree
+class TendonParams:
+    """Parameters of tendons (leading axis `m` in a `Term`), all differentiable but the last two.
+
+    natural: length at rest (ratio 1). commanded: rest length asked for now, `ratio * natural`.
+    modulus: the coefficient of the tendon's stiffness law.
+    attachment: what the energy's `points` needs to know; none for tendons fixed to nodes.
+    ends, width `(m, k)`: the node and the width of each anchor, if there are any of finite width.
+    """
+
+    natural: jax.Array
+    commanded: jax.Array
+    modulus: jax.Array
+    attachment: Any = None
+    width: Any = None
+    ends: Any = index_field(default=None)
+
+
+def inverse_square_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = modulus / commanded^2`: the reference law. It grows as the tendon is shortened."""
+    return modulus / commanded**2
+
+
+def inverse_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = EA / commanded`: an elastic thread of axial stiffness `EA = modulus`, wound in at its end."""
+    return modulus / commanded
+
+
+def constant_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
+    """`k = modulus`: a spring whose stiffness does not depend on the command."""
+    return modulus
+
+
+_LAWS = (inverse_square_stiffness, inverse_stiffness, constant_stiffness)
+
+
+def check_law(stiffness: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
+    """Refuse what is not a law of stiffness, a function of two numbers that returns one."""
+    form = "(modulus, commanded) -> k, such as inverse_square_stiffness"
+    checks.function("stiffness", stiffness, form)
+    if stiffness not in _LAWS:
+        checks.scalar("stiffness", form, stiffness, *2 * [jax.ShapeDtypeStruct((), jnp.result_type(float))])
+
+
+def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
+    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes."""
+    return x
+
+
+def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
+    """The points `(p, 2)` of a tendon that are weighted means, by weights `(p, k)`, of its `k` nodes."""
+    return jnp.sum(attachment[:, :, None] * x, axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class TendonEnergy:
+    """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its points, `l*` the
+    commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes."""
+
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array]
+    points: Callable[[jax.Array, Any], jax.Array] = at_nodes
+
+    def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        stretch = self.length(x, params) - params.commanded
+        return 0.5 * self.stiffness(params.modulus, params.commanded) * stretch**2
+
+    def length(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        """Present length `l`."""
+        return polyline_length(self.points(x, params.attachment))
+
+    def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        """`dE/dl = k (l - l*)`, positive when it pulls."""
+        return self.stiffness(params.modulus, params.commanded) * (self.length(x, params) - params.commanded)
+
+
+def polyline_length(x: jax.Array) -> jax.Array:
+    """Length `(...)` of the line through the points `x` `(..., k, 2)`.
+
+    Where two neighbours meet the length has no derivative; there it and every higher one is zero, not NaN.
+    """
+    xp = namespace(x)
+    squared = xp.sum((x[..., 1:, :] - x[..., :-1, :]) ** 2, axis=-1)
+    apart = squared > 0
+    return xp.sum(xp.where(apart, xp.sqrt(xp.where(apart, squared, 1)), 0), axis=-1)
+
+
+@usual_rules
+def tendons(
+    mesh: Mesh,
+    nodes: Numbers,
+    modulus: Numbers,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    width: Numbers = 0.0,
+) -> Term:
+    """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
+
+    Args:
+        mesh: natural lengths are measured on its rest positions, and differentiable in them.
+        nodes: `(m, k)` node numbers: the two ends of each tendon, with any guides between.
+        modulus: coefficient of the stiffness law, positive; scalar or `(m,)`.
+        stiffness: the law `(modulus, commanded) -> k`, such as `inverse_square_stiffness` (of the reference
+            scene; unit of modulus: force x length), `inverse_stiffness` (force) or `constant_stiffness`
+            (force / length). Tendons of another law are another term.
+        width: of the patch of surface that each node stands for (see `jaxbeam.mesh.surface`), scalar or `(m, k)`. At
+            0 the tendon pulls on the node alone: a point load, whose answer has no limit as the mesh is refined.
+
+    Raises:
+        ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
+            nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
+    """
+    check_law(stiffness)
+    lines = check_nodes("nodes", mesh, nodes, ndim=2)
+    if lines.shape[1] < 2:
+        raise ValueError(f"nodes: expected at least two nodes for each tendon, got shape {lines.shape}")
+    ordered = np.sort(lines, axis=1)
+    if (np.diff(ordered, axis=1) == 0).any():
+        k = int(np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))[0])
+        raise ValueError(f"nodes: tendon {k} repeats a node: {lines[k].tolist()}; give each of its points once")
+    modulus = checks.numbers("modulus", modulus, checks.POSITIVE, ((), lines.shape[:1]))
+    if not is_concrete(width):
+        raise ValueError("width: expected known numbers, got traced ones; the nodes of a patch depend on its width")
+    tents = checks.numbers("width", width, checks.NOT_NEGATIVE, ((), lines.shape))
+    widths = np.broadcast_to(tents.astype(float), lines.shape)
+    dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
+    anchored: tuple[np.ndarray, ...] = ()
+    if not widths.any():
+        nodes_of, energy = lines, TendonEnergy(stiffness)
+        natural = polyline_length(rest[lines])
+    else:
+        nodes_of, weights = _means(mesh, lines, widths)
+        energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
+        natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, np.asarray(rest)[nodes_of]).astype(dtype))
+    xp = namespace(modulus)
+    moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
+    return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
+
+
+def _means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes `(m, k)` of the patches of each tendon, and the weights `(m, p, k)` of its `p` points."""
+    found = [
+        [patch(mesh, int(node), float(width)) for node, width in zip(*pair, strict=True)]
+        for pair in zip(lines, widths, strict=True)
+    ]
+    unions = [np.unique(np.concatenate([nodes for nodes, _ in line])) for line in found]
+    most = max(len(union) for union in unions)
+    # Filled up with the last node, at weight 0.
+    nodes = np.stack([np.append(union, np.full(most - len(union), union[-1])) for union in unions])
+    weights = np.zeros((*lines.shape, most))
+    for k, line in enumerate(found):
+        for p, (members, values) in enumerate(line):
+            weights[k, p, np.searchsorted(unions[k], members)] = values
+    return nodes, weights

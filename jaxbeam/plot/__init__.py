@@ -1,0 +1,21 @@
+"""Pictures and animations of beams. The only room that needs matplotlib: import it by name.
+
+Every function draws into the `ax` it is given or into a new `Figure`, and leaves pyplot, its backend and `rcParams`
+alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an animation with
+`save_animation`. Lengths, forces and stresses are in the user's units.
+
+A tendon that pulls is drawn solid and one that pushes dashed. The patch of surface that an anchor of finite width pulls
+on is a heavier line in the tendon's colour. A rod, whose nodes are `(n, 3)`, is drawn as its centre line. Colours are
+those of Okabe and Ito (2008), which survive colour blindness; several curves also differ in their markers.
+"""
+
+from jaxbeam.plot.animations import animate_beams as animate_beams
+from jaxbeam.plot.animations import animate_ramp as animate_ramp
+from jaxbeam.plot.animations import save_animation as save_animation
+from jaxbeam.plot.drawing import limits as limits
+from jaxbeam.plot.states import States as States
+from jaxbeam.plot.stills import beam as beam
+from jaxbeam.plot.stills import branches as branches
+from jaxbeam.plot.stills import curves as curves
+from jaxbeam.plot.stills import field as field
+from jaxbeam.plot.stills import gallery as gallery

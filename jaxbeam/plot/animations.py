@@ -1,0 +1,122 @@
+"""Animations of ramps and of beams side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _fit, _legend, _panels, _prepare, _pushing, _ratios, limits
+from jaxbeam.plot.lines import extremes
+from jaxbeam.plot.states import States
+from jaxbeam.plot.stills import curves
+from jaxbeam.scene.measures import tip_angle
+from jaxbeam.scene.scene import Scene
+
+# Frames for which an animation rests on its last state.
+HOLD = 6
+
+
+# ------------------------------------------------------------------------------------------- animations
+
+
+def animate_ramp(
+    states: States,
+    measure: Callable[[Scene, jax.Array], jax.Array] = tip_angle,
+    label: str = "tip angle (degrees)",
+) -> FuncAnimation:
+    """A beam in motion, and beside it the curve that it traces.
+
+    Args:
+        states: such as a ramp.
+        measure: as in `curves`.
+        label: of the curve's vertical axis: quantity and unit.
+    """
+    figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _prepare(left, limits(*extremes(states.scene, states.x)))
+    curves([states], measure, label, ax=right)
+    # The whole curve stays as a pale trace, so that the axes do not move, and one line on top of it grows.
+    traced = []
+    for line in right.get_lines():
+        traced.append((right.plot([], [], color=line.get_color(), linewidth=2.0)[0], np.transpose(line.get_data())))
+        line.set(alpha=0.3)
+    (head,) = right.plot([], [], "o", color=OUTLINE, markersize=6)
+
+    def trace(frame: int) -> None:
+        for line, points in traced:
+            line.set_data(*points[: frame + 1].T)
+        head.set_data(*np.transpose([points[frame] for _, points in traced]))
+
+    return _play(figure, [left], [states], trace)
+
+
+def animate_beams(states: Sequence[States]) -> FuncAnimation:
+    """Several beams side by side, to one scale and in step.
+
+    Args:
+        states: one for each panel, all with the same number of states.
+
+    Raises:
+        ValueError: if `states` is empty or the numbers of states differ.
+    """
+    if not states:
+        raise ValueError("states: expected at least one States, got none")
+    if len({len(each) for each in states}) > 1:
+        raise ValueError(f"states: expected as many states in each, got {[len(each) for each in states]}")
+    bounds = limits(*(points for each in states for points in extremes(each.scene, each.x)))
+    figure, axes = _panels(len(states), [bounds])
+    return _play(figure, axes, states)
+
+
+def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dpi: float = 110) -> None:
+    """Write an animation as `.gif`, which needs no other program, or as `.mp4`, which needs ffmpeg.
+
+    Args:
+        animation: of `animate_ramp` or `animate_beams`.
+        path: where to; its ending decides the format.
+        fps: frames a second.
+        dpi: pixels an inch.
+
+    Raises:
+        ValueError: if the ending is another one, or ffmpeg is needed and not installed.
+    """
+    ending = Path(path).suffix.lower()
+    writer: AbstractMovieWriter
+    if ending == ".gif":
+        writer = PillowWriter(fps=fps)
+    elif ending == ".mp4":
+        if not FFMpegWriter.isAvailable():
+            raise ValueError(f"path: {path} needs ffmpeg, which is not installed; install it or save as .gif")
+        writer = FFMpegWriter(fps=fps)
+    else:
+        raise ValueError(f"path: expected an ending of .gif or .mp4, got {str(path)!r}")
+    animation.save(path, writer=writer, dpi=dpi)
+
+
+def _play(
+    figure: Figure, axes: Sequence[Axes], states: Sequence[States], trace: Callable[[int], None] = lambda frame: None
+) -> FuncAnimation:
+    """Animate each of `states` on its axes; `trace` draws what else changes."""
+    beams = [_Beam(ax, each.scene) for ax, each in zip(axes, states, strict=True)]
+    pushing = [each.measure(_pushing) for each in states]
+    _legend(figure, pushing)
+
+    def draw(frame: int) -> None:
+        for ax, artists, each, push in zip(axes, beams, states, pushing, strict=True):
+            artists.move(each.x[frame], push[frame])
+            ax.set_title("\n".join(filter(None, [each.title, _ratios(each.commands[frame])])), fontsize="medium")
+        trace(frame)
+
+    # Laid out once: a layout of its own for every frame would be slow, and the panels would jitter.
+    draw(0)
+    _fit(figure, axes[:1])
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    last = len(states[0]) - 1
+    return FuncAnimation(figure, draw, frames=[*range(last), *[last] * HOLD], interval=80, cache_frame_data=False)

@@ -1,0 +1,182 @@
+"""The artists of one beam, its axes and its legend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+
+from jaxbeam.core.tree import Numbers
+from jaxbeam.plot.lines import arms, edge_curves, elements_of, outline, patches, rings, tendon_points
+from jaxbeam.scene.measures import tendon_tensions
+from jaxbeam.scene.scene import Scene, placed, tendon_count
+
+Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+
+
+PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+MARKERS = ("o", "s", "^", "D", "v", "P")
+
+
+BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
+
+
+PUSHING = (0, (2.2, 1.3))
+
+
+UNSTABLE = (0, (3.0, 1.8))
+
+
+# Width of a figure in inches: the text width of a paper.
+PAPER = 7.2
+
+
+def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
+    """Axis limits `((x0, x1), (y0, y1))` that hold all points of `positions`, arrays `(..., 2)` or `(..., 3)` of a rod.
+
+    Those that pictures choose by default hold, besides the nodes, what lies outside them: curved edges, and tendons
+    beside a rod.
+
+    Args:
+        positions: in the user's length unit.
+        margin: added on each side, as a fraction of the larger extent.
+
+    Raises:
+        ValueError: if there is no point or one is not finite.
+    """
+    points = np.concatenate([np.zeros((0, 2)), *(np.asarray(p)[..., :2].reshape(-1, 2) for p in positions)])
+    if not points.size or not np.isfinite(points).all():
+        raise ValueError("positions: expected at least one point, all of them finite; see check(solution)")
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = margin * (high - low).max()
+    return (float(low[0] - pad), float(high[0] + pad)), (float(low[1] - pad), float(high[1] + pad))
+
+
+# --------------------------------------------------------------------------------------------- internals
+
+
+class _Beam:
+    """The artists of one beam; `move` puts them where the nodes are."""
+
+    def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
+        self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
+        self.patches, self.shares, pulling = patches(scene)
+        self.rod = self.elements.shape[1] == 2
+        rest = np.asarray(scene.mesh.nodes)
+        dotted = {"colors": GHOST, "linewidths": 0.9, "linestyles": "dotted"}
+        ghost = LineCollection(list(edge_curves(rest, self.edges)), label="at rest", zorder=1, **dotted)
+        self.body = PolyCollection([], facecolor=BODY, edgecolor=MESH, linewidth=0.35, capstyle="round", zorder=2)
+        width = 2.6 if self.rod else 0.9
+        self.outline = LineCollection([], colors=OUTLINE, linewidths=width, capstyle="round", zorder=3)
+        colours = [tendon_colours[number % len(tendon_colours)] for number in range(tendon_count(scene))]
+        # What tendons are held by, other than nodes: a patch of surface, or an arm of the rod.
+        width = 0.9 if self.rod else 2.8
+        self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
+        for collection in (ghost, self.body, self.outline, self.held):
+            ax.add_collection(collection, autolim=False)
+        _draw_clamp(ax, scene, self.edges)
+        self.tendons: list[Line2D] = []
+        for colour in colours:
+            self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
+        (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
+
+    def move(self, x: np.ndarray, pushing: np.ndarray) -> None:
+        """Draw the beam at `x` `(n, 2)`; tendons that push, `pushing` `(m,)`, are dashed."""
+        around: Any = rings(x, self.elements)  # matplotlib is far quicker with an array than with the list it asks for
+        self.body.set_verts(around, closed=not self.rod)
+        self.outline.set_segments(list(edge_curves(x, self.edges)))
+        self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
+        paths = tendon_points(self.scene, x)
+        self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
+        for number, (line, path, push) in enumerate(zip(self.tendons, paths, pushing, strict=True)):
+            line.set_data(*path.T)
+            line.set(linestyle=PUSHING if push else "-", label=f"tendon {number + 1}" + " (pushing)" * bool(push))
+
+
+def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
+    """`(m,)`: which tendons push. One at its commanded length, but for round-off, does neither."""
+    return tendon_tensions(scene, x.at[:, :2].multiply(1 + 1e-5)) < 0
+
+
+def _positions(scene: Scene, x: Numbers) -> np.ndarray:
+    positions = np.asarray(placed(scene, x))
+    if not np.isfinite(positions).all():
+        raise ValueError("x: some positions are not finite and cannot be drawn; see check(solution)")
+    return positions
+
+
+def _draw_clamp(ax: Axes, scene: Scene, edges: np.ndarray) -> None:
+    """Hatching outside every boundary edge whose ends are fixed, and a square on every other fixed node."""
+    rest = np.asarray(scene.mesh.nodes)
+    walls = edges[scene.fixed[edges].all(axis=(1, 2))]
+    lonely = np.setdiff1d(np.flatnonzero(scene.fixed.any(axis=1)), walls)
+    ax.plot(*rest[lonely, :2].T, "s", color=OUTLINE, markersize=4, zorder=7)
+    lines = edge_curves(rest, walls)
+    along = np.gradient(lines, axis=1)
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    outward *= 0.025 * np.ptp(rest[:, :2], axis=0).max() / np.linalg.norm(outward, axis=-1, keepdims=True)
+    strips = np.concatenate([lines, (lines + outward)[:, ::-1]], axis=1)
+    hatching = PolyCollection(list(strips), facecolor="none", edgecolor=OUTLINE, linewidth=0, hatch="//////", zorder=1)
+    ax.add_collection(hatching, autolim=False)
+    ax.add_collection(LineCollection(list(lines), colors=OUTLINE, linewidths=2.2, zorder=4), autolim=False)
+
+
+def _prepare(ax: Axes, bounds: Limits) -> Axes:
+    ax.set(xlim=bounds[0], ylim=bounds[1], xlabel="x (length units)", ylabel="y (length units)")
+    ax.set_aspect("equal")
+    return ax
+
+
+def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
+    """A figure with a row of panels for each of `rows`, the limits of its panels; only the outer ones are labelled."""
+    heights = [y1 - y0 for _, (y0, y1) in rows]
+    # The padding keeps the last tick label of one panel apart from the first of the next.
+    figure = Figure(figsize=(PAPER, PAPER), layout=ConstrainedLayoutEngine(w_pad=0.08))
+    grid = figure.subplots(len(rows), columns, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
+    for panels, bounds in zip(grid, rows, strict=True):
+        for ax in panels:
+            _prepare(ax, bounds).label_outer()
+    if len(rows) > 1:  # one label for all rows: a flat panel has no room for its own
+        figure.supylabel("y (length units)", fontsize="medium")
+        for ax in grid[:, 0]:
+            ax.set_ylabel("")
+    return figure, list(grid.ravel())
+
+
+def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Make the figure as high as `axes`, one panel of each row, need, so that none floats in empty space."""
+    for ax in axes:
+        ax.set_aspect("auto")
+    for _ in range(2):  # tick labels depend on the height: the second pass measures them at nearly the last one
+        figure.draw_without_rendering()
+        excess = 0.0
+        for ax in axes:
+            (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+            width, height = ax.get_position().size * figure.get_size_inches()
+            excess += height - width * (y1 - y0) / (x1 - x0)
+        figure.set_figheight(figure.get_figheight() - excess)
+    for ax in axes:
+        ax.set_aspect("equal")
+
+
+def _legend(figure: Figure, pushing: Sequence[np.ndarray]) -> None:
+    """One legend below all panels; `pushing`, of each beam, is `(..., m)`: whether a tendon ever pushes."""
+    tendons = range(max(each.shape[-1] for each in pushing))
+    handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=f"tendon {k + 1}") for k in tendons]
+    if any(each.any() for each in pushing):
+        handles.append(Line2D([], [], color="0.3", lw=2, linestyle=PUSHING, label="pushing"))
+    handles.append(Line2D([], [], color=GHOST, linestyle="dotted", label="at rest"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False)
+
+
+def _ratios(ratios: np.ndarray) -> str:
+    return "ratios " + ", ".join(f"{ratio:.2f}" for ratio in ratios)

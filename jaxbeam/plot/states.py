@@ -1,0 +1,51 @@
+"""States of one scene under several commands: what curves and animations are drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core.tree import Numbers
+from jaxbeam.scene.scene import Scene, command, tendon_count
+
+
+class States:
+    """States of one scene under `s` commands: a ramp, or a sweep.
+
+    Args:
+        scene: with `n` nodes and `m` tendons.
+        commands: `(s, m)` ratios, dimensionless: `commands(ratios, steps)` for a ramp.
+        x: `(s, n, 2)` node positions: `Solution.x` of that ramp or sweep.
+        title: what to call them in pictures.
+
+    Raises:
+        ValueError: if a shape is wrong, there is no state, or a position is not finite.
+    """
+
+    def __init__(self, scene: Scene, commands: Numbers, x: Numbers, title: str = "") -> None:
+        count = tendon_count(scene)
+        self.scene, self.commands, self.x, self.title = scene, np.asarray(commands), np.asarray(x), title
+        if self.commands.ndim != 2 or self.commands.shape[0] == 0 or self.commands.shape[1] != count:
+            raise ValueError(f"commands: expected shape (s, {count}), a row for each state, got {self.commands.shape}")
+        expected = (len(self.commands), *scene.mesh.nodes.shape)
+        if self.x.shape != expected:
+            raise ValueError(f"x: expected shape {expected}, one entry for each command, got {self.x.shape}")
+        broken = np.flatnonzero(~np.isfinite(self.x).all(axis=(1, 2)))
+        if broken.size:
+            raise ValueError(f"x: state {broken[0]} is not finite and cannot be drawn; see check(solution)")
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def measure(self, function: Callable[[Scene, jax.Array], jax.Array]) -> np.ndarray:
+        """`function(scene, x)` of every state, such as `tip_angle` or `tendon_tensions`: leading axis `s`."""
+        one = lambda ratios, x: function(command(self.scene, ratios), x)
+        return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(self.commands), jnp.asarray(self.x)))
+
+    @property
+    def actuation(self) -> np.ndarray:
+        """`(s,)` ratio of the tendon whose command varies most; of the first of those that vary alike."""
+        return self.commands[:, np.argmax(np.ptp(self.commands, axis=0).round(6))]

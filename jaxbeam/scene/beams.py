@@ -1,0 +1,131 @@
+"""The reference scenes: the tendon beam of triangles and as a rod."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.mesh.line import straight
+from jaxbeam.mesh.mesh import with_middles
+from jaxbeam.mesh.rectangle import Diagonals, middle_column, rectangle
+from jaxbeam.physics.materials import lame, macklin_mueller
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.physics.solid import solid
+from jaxbeam.physics.tendon import inverse_square_stiffness, tendons
+from jaxbeam.scene.scene import Scene, clamped
+
+
+@usual_rules
+def tendon_beam(
+    nx: int = 29,
+    ny: int = 7,
+    length: Numbers = 3.5,
+    height: Numbers = 0.8,
+    young: Numbers = 1e4,
+    poisson: Numbers = 0.45,
+    tendon_modulus: Numbers = 2e3,
+    *,
+    order: int = 1,
+    degree: int | None = None,
+    anchor_width: float = 0.0,
+    graded: bool = False,
+    diagonals: Diagonals = "one-sided",
+    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    dtype: Any = None,
+) -> Scene:
+    """The reference scene: a cantilever clamped at its left edge, with a tendon along half of each side.
+
+    The first tendon joins the top-left and the top-middle node, the second the bottom-left and the
+    bottom-middle node. Both are at their natural length, half the beam's.
+
+    Args:
+        nx: corners of triangles along the length, odd unless `graded`, so that a middle one exists.
+        ny: corners along the height.
+        length: of the beam, positive.
+        height: of the beam, positive.
+        young: Young's modulus, scalar or one for each triangle.
+        poisson: Poisson's ratio, scalar or one for each triangle; `lame` turns both into Lame parameters.
+        tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
+        order: 1 for triangles of three nodes, which lock as `poisson` nears 0.5, or 2 for six (see `rectangle`).
+        degree: of the quadrature, see `solid`.
+        anchor_width: of the patches that the free ends of the tendons pull on, see `tendons`. At 0 they pull on single
+            nodes, whose answer drifts as the mesh is refined: for a pull on the top to 0.8, six-node triangles give
+            9.77, 9.68, 9.46 degrees on 15 x 5, 29 x 7 and 57 x 13 corners, and 10.14 on each with a width of 0.25.
+        graded: crowd nodes at the clamp, the faces and the middle, where the tendons end; see `rectangle`.
+        diagonals: see `rectangle`.
+        density: the material, see `jaxbeam.physics.materials`.
+        stiffness: the law of the tendons, see `tendons`.
+        dtype: of everything computed; by default JAX's float.
+
+    Returns:
+        A `Scene`, differentiable in every real argument.
+
+    Raises:
+        ValueError: if `nx` is even and the mesh not graded, or as `rectangle`, `lame` and `tendons` do.
+    """
+    mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order, graded=graded)
+    anchor_width = checks.setting("anchor_width", anchor_width, checks.NOT_NEGATIVE)
+    bottom_left, top_left = 0, ny - 1
+    bottom_middle = middle_column(nx, graded) * ny
+    body = solid(mesh, lame(young, poisson), density, degree)
+    pair = [[top_left, bottom_middle + ny - 1], [bottom_left, bottom_middle]]
+    left, right = (with_middles(mesh, corners) for corners in (np.arange(ny), (nx - 1) * ny + np.arange(ny)))
+    pulls = tendons(mesh, pair, tendon_modulus, stiffness, np.array([[0.0, anchor_width]] * 2))
+    return Scene(mesh, (body, pulls), clamped(mesh, left), right)
+
+
+@usual_rules
+def rod_beam(
+    nodes: int = 9,
+    length: Numbers = 3.5,
+    height: Numbers = 0.8,
+    young: Numbers = 1e4,
+    poisson: Numbers = 0.45,
+    tendon_modulus: Numbers = 2e3,
+    *,
+    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    dtype: Any = None,
+) -> Scene:
+    """The reference scene as a rod (see `jaxbeam.rod`): a cantilever with a tendon along half of each side.
+
+    Args:
+        nodes: along the axis, odd, so that a middle one exists. Nine are within 0.5 % of the limit of many: at ratios
+            (0.8, 1.0) the tip turns by 10.31 degrees, in the limit by 10.35, by converged finite elements by 10.14.
+        length: of the beam, positive.
+        height: of the beam, positive.
+        young: Young's modulus, scalar or one for each element.
+        poisson: Poisson's ratio, scalar or one for each element; `lame` turns both into Lame parameters.
+        tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
+        density: the material, see `jaxbeam.physics.materials`. As in `tendon_beam`, (1e4, 0.45) behaves as (9962,
+            0.4444) in the default, and as it says in `neo_hookean`. `linear_elastic` makes Simo's rod, linear in its strains.
+        stiffness: the law of the tendons, see `tendons`.
+        dtype: of everything computed; by default JAX's float.
+
+    Returns:
+        A `Scene`, differentiable in every real argument. Positions `x` are `(n, 3)`; the third column is the height
+        times the angle of the section.
+
+    Raises:
+        ValueError: if `nodes` is even, or as `lame`, `rod` and `rod_tendons` do.
+    """
+    height = checks.number("height", height, checks.POSITIVE)
+    line = straight(length, height, nodes, dtype)
+    if nodes % 2 == 0:
+        raise ValueError(
+            f"nodes: expected an odd number, got {nodes}: no node lies in the middle, where the tendons end; use "
+            f"{max(nodes - 1, 3)} or {nodes + 1}"
+        )
+    body = rod(line, height, lame(young, poisson), density)
+    xp = namespace(height)
+    sides = xp.asarray([[0.5, 0.5], [-0.5, -0.5]]) * height
+    pulls = rod_tendons(line, [[0, (nodes - 1) // 2]] * 2, sides, tendon_modulus, stiffness)
+    return Scene(line, (body, pulls), clamped(line, [0]), np.array([nodes - 1]))

@@ -1,0 +1,201 @@
+"""What is measured on a beam: angles, positions, lengths, tensions, stresses, energies.
+
+Each takes the scene and node positions `x` `(n, 2)`, of a rod `(n, 3)`, is pure, and is differentiable in both. An `x`
+of another shape is refused: for many states use `jax.vmap`.
+Angles are in degrees, everything else in the user's units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.mesh.elements import EDGES, degree_of, rule
+from jaxbeam.mesh.line import Line
+from jaxbeam.physics.energy import Term
+from jaxbeam.physics.rod import RodEnergy
+from jaxbeam.physics.solid import SolidEnergy, SolidParams, displacement_gradients
+from jaxbeam.physics.tendon import TendonEnergy
+from jaxbeam.scene.scene import Scene, placed, solid_terms, tendon_terms
+
+
+@usual_rules
+def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
+    """Deflection of the tip `()` in degrees, `atan2(mean transverse displacement of the tip, length)`.
+
+    The beam's axis runs from the centroid of the clamped nodes to that of the tip nodes, both at rest;
+    length is their distance, and transverse is to its left. For the reference scene this is
+    `atan2(mean over the right edge of (y - y_rest), length)`.
+
+    Raises:
+        ValueError: if `x` has another shape, the scene has no tip or no clamped node, or its whole tip is clamped.
+    """
+    x = placed(scene, x)
+    if scene.fixed[_tip(scene)][:, :2].all():
+        raise ValueError(
+            "scene: its tip is clamped, so the tip angle is always 0; give Scene(..., tip=nodes) that move"
+        )
+    along, length = _axis(scene)
+    moved = tip_position(scene, x) - tip_position(scene, scene.mesh.nodes)
+    return jnp.rad2deg(jnp.arctan2(along[0] * moved[1] - along[1] * moved[0], length))
+
+
+@usual_rules
+def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
+    """Mean position `(2,)` of the tip nodes.
+
+    Raises:
+        ValueError: if `x` has another shape, or the scene has no tip.
+    """
+    return jnp.mean(placed(scene, x)[_tip(scene)][:, :2], axis=0)
+
+
+@usual_rules
+def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
+    """Rotation of the tip section `()` in degrees, anticlockwise: the rigid turn that fits it best.
+
+    Least squares in the plane (Kabsch 1976): `atan2(sum X x y, sum X . y)` about the centroids. Of a rod it is the
+    mean turn of the tip's nodes, which may be more than one round.
+
+    Raises:
+        ValueError: if `x` has another shape, the scene has no tip, or a solid fewer than two tip nodes.
+    """
+    x = placed(scene, x)
+    tip = _tip(scene)
+    if isinstance(scene.mesh, Line):
+        return jnp.rad2deg(jnp.mean((x - scene.mesh.nodes)[tip, 2]) / scene.mesh.radian)
+    if tip.shape[0] < 2:
+        raise ValueError(f"scene: expected at least two tip nodes to measure a rotation, got {tip.shape[0]}")
+    before, after = scene.mesh.nodes[tip], x[tip]
+    before, after = before - before.mean(axis=0), after - after.mean(axis=0)
+    sine = jnp.sum(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])
+    return jnp.rad2deg(jnp.arctan2(sine, jnp.sum(before * after)))
+
+
+@usual_rules
+def tendon_lengths(scene: Scene, x: jax.Array) -> jax.Array:
+    """Present length of each tendon, `(m,)`."""
+    return _over_tendons(scene, x, lambda energy: energy.length)
+
+
+@usual_rules
+def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
+    """Force `dE/dl = k (l - l*)` of each tendon, `(m,)`; positive when it pulls its ends together."""
+    return _over_tendons(scene, x, lambda energy: energy.tension)
+
+
+@usual_rules
+def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
+    """Cauchy stress `(t, 2, 2)` in the plane, one for each element of the solid: `P F^T / J`.
+
+    `P = d psi / d H` is the first Piola-Kirchhoff stress (Bonet and Wood 2008, eq. 5.49). Averaged over
+    an element's quadrature points.
+    """
+    return _over_elements(scene, x, _stress)
+
+
+@usual_rules
+def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
+    """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
+
+    In each element the linear field that fits the stress at the quadrature points best, by least squares with their
+    weights, is carried to the nodes; at a node the elements that meet there are averaged, weighted by area at rest
+    (local smoothing: Hinton and Campbell 1974, Int. J. Numer. Methods Eng. 8, 461-480). Where two materials meet the
+    stress jumps, and this is a mean of both sides; at a node that no solid reaches it is zero.
+
+    Raises:
+        ValueError: if the scene has no solid, or a solid has quadrature points of a rule that is not in
+            `jaxbeam.mesh.elements`.
+    """
+    x = placed(scene, x)
+    total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
+    for term, stress in _at_points(scene, x, _stress):
+        recover = jnp.asarray(_points_to_nodes(term.nodes.shape[1], stress.shape[1]), x.dtype)
+        areas = jnp.sum(term.params.weights, axis=1)
+        total = total.at[term.nodes].add(jnp.einsum("kq,mqij,m->mkij", recover, stress, areas))
+        area = area.at[term.nodes].add(areas[:, None])
+    return total / jnp.where(area > 0, area, 1)[:, None, None]
+
+
+@usual_rules
+def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
+    """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
+    x = placed(scene, x)
+    bodies = [t for t in scene.terms if isinstance(t.energy, SolidEnergy | RodEnergy)]
+    found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in bodies]
+    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
+
+
+@usual_rules
+def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
+    """`J = det F` `(t,)` of each element of the solid, averaged over its quadrature points."""
+    return _over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))
+
+
+def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> jax.Array:
+    F = H + jnp.eye(2, dtype=H.dtype)
+    return jax.grad(density)(H, material) @ F.T / jnp.linalg.det(F)
+
+
+def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
+    """For each solid, `measure(H, density, material)` at the quadrature points of its elements, `(m, q, ...)`."""
+    x, found = placed(scene, x), []
+    for term in solid_terms(scene):
+        assert isinstance(term.energy, SolidEnergy)
+        density = term.energy.density
+
+        def one(positions: jax.Array, params: SolidParams, density: Callable = density) -> jax.Array:
+            return jax.vmap(lambda H: measure(H, density, params.material))(displacement_gradients(positions, params))
+
+        found.append((term, jax.vmap(one)(x[term.nodes], term.params)))
+    if not found:
+        raise ValueError("scene: expected a solid term, got none; stress and J are measured on solids")
+    return found
+
+
+def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
+    """`measure(H, density, material)` on every element of the solids, averaged with the quadrature weights."""
+    mean = jax.vmap(lambda weights, values: jnp.tensordot(weights / jnp.sum(weights), values, axes=1))
+    return jnp.concatenate([mean(term.params.weights, values) for term, values in _at_points(scene, x, measure)])
+
+
+def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
+    """The matrix `(k, q)` from values at `q` quadrature points to those of the linear field that fits them best, at
+    the `k` nodes of the element. Fewer than three points do not fix a linear field: of those that fit the least is
+    taken, which for one point is constant."""
+    places, shares = rule(degree_of(points))
+    root = np.sqrt(shares)
+    at_corners = np.linalg.pinv(root[:, None] * places) * root
+    between = [(at_corners[a] + at_corners[b]) / 2 for a, b in EDGES]
+    return np.concatenate([at_corners, between])[:nodes]
+
+
+def _over_tendons(scene: Scene, x: jax.Array, measure: Callable[[TendonEnergy], Callable[..., jax.Array]]) -> jax.Array:
+    """A measure of each tendon, `(m,)`."""
+    x, found = placed(scene, x), []
+    for term in tendon_terms(scene):
+        assert isinstance(term.energy, TendonEnergy)
+        found.append(jax.vmap(measure(term.energy))(x[term.nodes], term.params))
+    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
+
+
+def _tip(scene: Scene) -> np.ndarray:
+    if scene.tip.shape[0] == 0:
+        raise ValueError("scene: its tip is empty; give Scene(..., tip=nodes) the nodes of the end section")
+    return scene.tip
+
+
+def _axis(scene: Scene) -> tuple[jax.Array, jax.Array]:
+    """Unit vector `(2,)` from clamp to tip at rest, and their distance `()`."""
+    held = scene.fixed.all(axis=1)
+    if not held.any():
+        raise ValueError("scene: no node is clamped, so the beam has no axis to measure its angle from")
+    rest = scene.mesh.nodes
+    span = tip_position(scene, rest) - jnp.mean(rest[np.flatnonzero(held)][:, :2], axis=0)
+    length = jnp.sqrt(jnp.sum(span**2))
+    return span / length, length

@@ -1,0 +1,75 @@
+"""Whether a body passes through itself.
+
+Nothing here models contact, so two parts of a body may come to lie in one place: an equilibrium of the model, but of no
+real beam. Where that happens two edges of its surface cross.
+
+The surface is taken as straight segments. The edge of a six-node triangle is a parabola and is cut into `SEGMENTS` of
+them. A rod's surface is the pair of lines at half its height on either side of each element.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.physics.rod_tendon import Offsets, at_offsets
+from jaxbeam.scene.scene import Scene, rod_terms
+
+# Segments of a curved edge.
+SEGMENTS = 4
+
+
+def crossing(scene: Scene, x: jax.Array) -> jax.Array:
+    """The first two edges of the surface that cross at `x` `(n, d)`, as node numbers `(2, 2)` of their ends; -1 if none
+    do. Edges that share a node do not count: `J` says whether these fold over."""
+    segments = [_of_solids(scene, x), *_of_rods(scene, x)]
+    points, ids, edges = (jnp.concatenate(each) for each in zip(*segments, strict=True))
+    if not len(points):
+        return jnp.full((2, 2), -1, jnp.int32)
+    start, along = points[:, 0], points[:, 1] - points[:, 0]
+
+    def sides(which: int) -> jax.Array:
+        """On which side of each segment (rows) the start or the end of each segment (columns) lies."""
+        gap = points[None, :, which] - start[:, None]
+        return along[:, None, 0] * gap[..., 1] - along[:, None, 1] * gap[..., 0]
+
+    apart = sides(0) * sides(1) < 0
+    joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
+    # Of segments in one line round-off decides the sides. Those that lie one after the other do not meet.
+    low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
+    near = jnp.all(low[:, None] <= high[None, :], axis=2)
+    crossed = (apart & apart.T & near & near.T & ~joined).ravel()
+    first = jnp.argmax(crossed)
+    pair = edges[jnp.stack([first // len(points), first % len(points)])]
+    return jnp.where(crossed[first], pair, -1)
+
+
+def _of_solids(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Segments of the surface: points `(s, 2, 2)`, the numbers `(s, 2)` of these, and the ends `(s, 2)` of its edge."""
+    edges = jnp.asarray(scene.surface)
+    parts = 1 if edges.shape[1] == 2 else SEGMENTS
+    xi = np.linspace(0, 1, parts + 1)
+    functions = np.stack([1 - xi, xi], 1) if parts == 1 else _parabola(xi)
+    curves = jnp.einsum("pk,ekd->epd", jnp.asarray(functions, x.dtype), x[edges, :2])
+    # Points between the ends of an edge are numbered after the nodes.
+    between = len(x) + jnp.arange(len(edges) * (parts - 1), dtype=jnp.int32).reshape(len(edges), parts - 1)
+    numbers = jnp.concatenate([edges[:, :1], between, edges[:, 1:2]], axis=1)
+    pairs = lambda each: jnp.stack([each[:, :-1], each[:, 1:]], axis=2).reshape(-1, 2, *each.shape[2:])
+    return pairs(curves), pairs(numbers), jnp.repeat(edges[:, :2], parts, axis=0)
+
+
+def _parabola(xi: np.ndarray) -> np.ndarray:
+    """Shape functions `(p, 3)` of an edge of three nodes, its ends first, at `xi` from 0 to 1."""
+    return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=1)
+
+
+def _of_rods(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+    """The same for both sides of each rod."""
+    found = []
+    for term in rod_terms(scene):
+        nodes = jnp.asarray(term.nodes)
+        for side in (0.5, -0.5):
+            offsets = Offsets(jnp.tile(side * term.params.height[:, None], 2), term.params.radian)
+            found.append((at_offsets(x[nodes], offsets), nodes, nodes))
+    return found

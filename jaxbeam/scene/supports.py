@@ -1,0 +1,197 @@
+"""What must hold before a scene is solved: every piece of its mesh is held against rigid motion.
+
+Checked on the host, while everything is concrete. A scene that is not held can still be built, drawn and measured.
+
+A rigid motion of a piece has three coordinates `q`: a translation, and a rotation about its centre times its size. What
+the terms other than the body resist it with is the second variation of their energy along the motion,
+
+    d2E/dq2 = J^T H J + sum g . d2x/dq2,     J = dx/dq,
+
+with `g` and `H` the gradient and the Hessian of the energy in positions. The second part is there because a rotating
+node moves on a circle: without it a taut tendon inside the piece would seem to resist, and a hanging load would not.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxbeam.core.tree import Key, is_concrete, key_of, replace, unlock
+from jaxbeam.mesh.line import Line
+from jaxbeam.mesh.mesh import pieces
+from jaxbeam.physics.energy import Term
+from jaxbeam.physics.rod import RodEnergy
+from jaxbeam.physics.solid import SolidEnergy
+from jaxbeam.physics.stencils import stencil_gradients, stencil_hessian
+from jaxbeam.scene.scene import Scene
+
+# Round-off of a stencil's second variation, in eps of its dtype times the magnitudes that were added up in it. Measured
+# on tendons inside a body, with guides, patches and eccentricities, up to 1e5 from the origin: at most 0.5.
+NOISE = 64
+
+
+class Rigid(NamedTuple):
+    """The rigid motions of the pieces of a mesh.
+
+    piece `(n,)`: of each node. centres `(c, 2)` and sizes `(c,)`: of each piece. slope `(n, d, 3 c)`: derivative of the
+    positions. bend `(n, d)`: their second derivative in the rotation of their piece. far `(n, d)`: its magnitude with
+    the round-off of positions far from the origin.
+    """
+
+    piece: np.ndarray
+    centres: np.ndarray
+    sizes: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    far: np.ndarray
+
+
+class Resistance(NamedTuple):
+    """Second variation `(3 c, 3 c)` and slope `(3 c,)` of an energy along the rigid motions, and the `noise` in the
+    former."""
+
+    second: np.ndarray
+    slope: np.ndarray
+    noise: float
+
+
+def check_held(scene: Scene) -> None:
+    """Refuse a scene in which a piece of the mesh moves rigidly, against no clamp, no spring and no load.
+
+    Its tangent stiffness would be singular at rest. A solid or a rod itself never resists a rigid motion, so only
+    the other terms are asked, and only if clamped nodes alone do not hold every piece. A load that drives the motion
+    instead, as one that stands on a hinge, leaves no singular stiffness: what becomes of it the solver finds.
+
+    Raises:
+        ValueError: that names the piece and its free motions. Nothing is checked while a value is traced, or where an
+            energy is not finite.
+    """
+    known = is_concrete(scene.mesh.elements, scene.fixed)
+    if known and _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
+        return
+    if not is_concrete(*jax.tree.leaves(scene)):
+        return
+    rigid = _rigid_motions(scene)
+    _, values, basis = np.linalg.svd(rigid.slope[scene.fixed], full_matrices=True)
+    free = basis[np.sum(values > 1e-9) :].T
+    others = tuple(term for term in scene.terms if not isinstance(term.energy, SolidEnergy | RodEnergy))
+    if free.shape[1] and others:
+        free = _unresisted(replace(scene, terms=others), rigid, free)
+    if not free.shape[1]:
+        return
+    count = len(rigid.centres)
+    loose = free.reshape(count, 3, -1)
+    k = int(np.argmax(np.linalg.norm(loose, axis=(1, 2))))
+    node = np.argmax(rigid.piece == k)
+    body = "the body" if count == 1 else f"the mesh is in {count} pieces, and the one with node {node}"
+    motions = _name_motions(loose[k], rigid.centres[k], float(rigid.sizes[k]))
+    raise ValueError(
+        f"fixed: {body} is not held, it moves rigidly without resistance: {motions}; "
+        f"fix more coordinates, for example with clamped(mesh, nodes), or hold it by penalty_springs"
+    )
+
+
+@lru_cache(maxsize=32)
+def _clamps_suffice(elements: Key, fixed: Key) -> bool:
+    """Whether each piece of the mesh has as many clamped nodes as hold it wherever they are: two, or one of a rod."""
+    piece = pieces(elements.array, fixed.array.shape[0])
+    enough = 2 if fixed.array.shape[1] == 2 else 1
+    return bool((np.bincount(piece, fixed.array.all(axis=1)) >= enough).all())
+
+
+def _rigid_motions(scene: Scene) -> Rigid:
+    """The rigid motions of a concrete scene, at rest."""
+    whole = np.asarray(scene.mesh.nodes, float)
+    piece, rest = pieces(scene.mesh.elements, len(whole)), whole[:, :2]
+    own = [piece == k for k in range(int(piece.max()) + 1)]
+    centres = np.stack([rest[nodes].mean(axis=0) for nodes in own])
+    sizes = np.array([np.ptp(rest[nodes], axis=0).max() for nodes in own])
+    arms, size = rest - centres[piece], sizes[piece]
+    slope, bend, far = np.zeros((*whole.shape, len(own), 3)), np.zeros(whole.shape), np.zeros(whole.shape)
+    node = np.arange(len(whole))
+    slope[node, 0, piece, 0] = slope[node, 1, piece, 1] = 1
+    slope[node, :2, piece, 2] = arms[:, ::-1] * [-1, 1] / size[:, None]
+    if isinstance(scene.mesh, Line):
+        # The third coordinate is an angle: it turns at a constant rate.
+        slope[node, 2, piece, 2] = float(scene.mesh.radian) / size
+    bend[:, :2] = -arms / size[:, None] ** 2
+    far[:, :2] = (np.abs(arms) + np.abs(rest)) / size[:, None] ** 2
+    return Rigid(piece, centres, sizes, slope.reshape(*whole.shape, -1), bend, far)
+
+
+def _unresisted(scene: Scene, rigid: Rigid, free: np.ndarray) -> np.ndarray:
+    """Of the motions `free` `(3 c, f)` that the fixed coordinates leave, those `(3 c, u)` that no term resists."""
+    eps = float(np.finfo(scene.mesh.nodes.dtype).eps)
+    # Inside jit too the scene is constant, and so are these.
+    with jax.ensure_compile_time_eval():
+        derivatives = jax.device_get(_derivatives(unlock(scene), scene.mesh.nodes))
+    if not all(np.isfinite(each).all() for each in jax.tree.leaves(derivatives)):
+        return free[:, :0]
+    found = [_resistance(term, g, H, rigid, eps) for term, (g, H) in zip(scene.terms, derivatives, strict=True)]
+    second, slope = (np.sum(parts, axis=0) for parts in ([f.second for f in found], [f.slope for f in found]))
+    noise = sum(f.noise for f in found)
+    # A fixed coordinate keeps its place to second order too: what holds it there acts like a load on a moving node.
+    reactions = np.linalg.lstsq(rigid.slope[scene.fixed].T, slope)[0]
+    turns = 3 * rigid.piece[np.nonzero(scene.fixed)[0]] + 2
+    np.add.at(second, (turns, turns), -reactions * rigid.bend[scene.fixed])
+    noise += NOISE * eps * float(np.abs(reactions) @ np.abs(rigid.bend[scene.fixed]))
+    values, vectors = np.linalg.eigh(free.T @ second @ free)
+    return free @ vectors[:, np.abs(values) <= noise]
+
+
+@jax.jit
+def _derivatives(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """For each term, gradients `(m, k, d)` and Hessians `(k d, k d, m)` of its stencils."""
+    return [(stencil_gradients(term, x)[1], stencil_hessian(term, x)) for term in scene.terms]
+
+
+def _resistance(term: Term, gradients: np.ndarray, hessians: np.ndarray, rigid: Rigid, eps: float) -> Resistance:
+    """The resistance of a term whose stencils have these derivatives.
+
+    The round-off of each stencil is dropped before stencils are added up. Otherwise that of a stiff tendon inside a
+    piece would count as resistance, or hide the resistance of a weak spring.
+    """
+    size = rigid.slope.shape[2]
+    second, slope, noise = np.zeros((size, size)), np.zeros(size), 0.0
+    of_nodes = rigid.piece[term.nodes]
+    together = np.sort(of_nodes, axis=1)
+    for row in np.unique(together, axis=0):
+        own = (together == row).all(axis=1)
+        touched = np.unique(row)
+        used = (3 * touched[:, None] + np.arange(3)).ravel()
+        nodes = term.nodes[own]
+        J = rigid.slope[nodes][..., used].reshape(len(nodes), -1, len(used))
+        g, H = np.asarray(gradients, float)[own], np.moveaxis(np.asarray(hessians, float)[..., own], -1, 0)
+        flat = g.reshape(len(nodes), -1)
+        each = J.transpose(0, 2, 1) @ H @ J
+        for k, piece in enumerate(touched):
+            circling = np.where(of_nodes[own] == piece, np.sum(g * rigid.bend[nodes], axis=2), 0)
+            each[:, 3 * k + 2, 3 * k + 2] += circling.sum(axis=1)
+        stiff = (np.abs(J).transpose(0, 2, 1) @ np.abs(H) @ np.abs(J)).max(axis=(1, 2))
+        force = np.sum(np.abs(g) * rigid.far[nodes], axis=(1, 2))
+        values, vectors = np.linalg.eigh(each)
+        values = np.where(np.abs(values) > NOISE * eps * (stiff + force)[:, None], values, 0)
+        second[np.ix_(used, used)] += np.einsum("mpr,mr,mqr->pq", vectors, values, vectors)
+        # Forces keep an error of eps; a stiffness that is left has directions wrong by eps, which enter squared.
+        rough = NOISE * eps * force + max(NOISE * float(np.finfo(float).eps), (NOISE * eps) ** 2) * stiff
+        noise += float(rough[values.any(axis=1)].sum())
+        pulls, most = np.einsum("ma,map->mp", flat, J), np.einsum("ma,map->mp", np.abs(flat), np.abs(J))
+        slope[used] += np.where(np.abs(pulls) > NOISE * eps * most, pulls, 0).sum(axis=0)
+    return Resistance(second, slope, noise)
+
+
+def _name_motions(motions: np.ndarray, centre: np.ndarray, size: float) -> str:
+    """Words for the space of rigid motions `(3, q)` of a piece, as translations and a rotation about `centre`."""
+    basis, values, _ = np.linalg.svd(motions, full_matrices=False)
+    basis = basis[:, values > 1e-6 * values.max()]
+    inside = np.linalg.norm(basis, axis=1) > 1 - 1e-6
+    names = [n for n, i in zip(("translation in x", "translation in y", "rotation"), inside, strict=True) if i]
+    if len(names) == basis.shape[1]:
+        return " and ".join(names)
+    if basis.shape[1] == 1 and abs(basis[2, 0]) > 1e-6:
+        pivot = centre + size * np.array([-basis[1, 0], basis[0, 0]]) / basis[2, 0]
+        return f"rotation about ({pivot[0]:.4g}, {pivot[1]:.4g})"
+    return f"{basis.shape[1]} independent motions, mixed of translation and rotation"

@@ -1,0 +1,1 @@
+"""Equilibria: Newton's method, continuation, the implicit derivative, ramps and sweeps."""

@@ -1,0 +1,80 @@
+"""Actuation: a command approached step by step."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import compiled, usual_rules
+from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
+from jaxbeam.linear.layout import Layout
+from jaxbeam.scene.scene import Scene, command
+from jaxbeam.scene.supports import check_held
+from jaxbeam.solve.continuation import follow
+from jaxbeam.solve.equilibrium import differentiable_rows
+from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.predictor import begin
+from jaxbeam.solve.solution import Solution
+
+
+@usual_rules
+def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
+    """The commands `(steps, m)` of a ramp: evenly spaced from ratio 1 to `ratios` `(m,)`.
+
+    Raises:
+        ValueError: if `steps` is not a whole number of at least 2, or a concrete ratio is not positive and finite.
+
+    >>> [float(r) for r in commands([0.5], steps=3)[:, 0]]
+    [1.0, 0.75, 0.5]
+    """
+    checks.count("steps", steps, 2)
+    end = checks.numbers("ratios", ratios, checks.POSITIVE)
+    if end.ndim != 1:
+        raise ValueError(f"ratios: expected shape (m,), one for each tendon, got {end.shape}")
+    end = end if end.dtype.kind == "f" else end.astype(jnp.result_type(float))
+    way = np.linspace(0.0, 1.0, steps).astype(end.dtype)[:, None]
+    # Weighted, not 1 + way * (end - 1), so that the last command is `ratios` to the last bit.
+    return to_device((1 - way) + way * end)
+
+
+@usual_rules
+def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
+    """Equilibria on the way from ratio 1 to `ratios`, each started from the one before.
+
+    What a beam does when its tendons are pulled slowly: where an equilibrium depends on the path, this is
+    the one a user sees. Each start is predicted from the states before and their tangents.
+
+    The last state is judged by its own stiffness. One on the way, if it is one last step of less than a millionth of
+    the body from where its Newton's method began, is judged by the stiffness there.
+
+    Args:
+        scene: with `m` tendons.
+        ratios: `(m,)` at the end, positive.
+        steps: how many commands to solve, `commands(ratios, steps)`: the first at ratio 1; at least 2.
+        solver: settings of each solve.
+
+    Returns:
+        A `Solution` with leading axis `steps`; each step has its own status.
+
+    Raises:
+        ValueError: as `command` and `equilibrium` do, or if `steps` is not a whole number of at least 2.
+    """
+    check_asked(scene, solver)
+    checks.count("steps", steps, 2)
+    check_held(scene)
+    command(scene, ratios)  # checks the ratios
+    end = to_device(checks.real("ratios", ratios), scene.mesh.nodes.dtype)
+    layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
+    if is_concrete(end, *jax.tree.leaves(scene)):
+        return _ramp(open_scene, layout, end, steps, solver)
+    path = _ramp(*lax.stop_gradient((open_scene, layout, end)), steps, solver)
+    return differentiable_rows(open_scene, layout, commands(end, steps), path, solver)
+
+
+@compiled("steps", "solver")
+def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
+    targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
+    return follow(lambda s: command(scene, (1 - s) + s * end), layout, begin(scene.mesh.nodes), targets, solver)[0]

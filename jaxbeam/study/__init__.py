@@ -1,0 +1,1 @@
+"""What is asked of equilibria: stability, branches, errors, inverse design."""

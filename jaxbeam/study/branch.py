@@ -1,0 +1,298 @@
+"""Branches of equilibria, followed through folds, with the points where stability is lost and regained.
+
+Pseudo-arclength continuation (Keller 1977): a branch is a curve `(x(t), s(t))` with `s` the path's parameter,
+0 at ratio 1 and 1 at the command asked for. A step goes along the tangent, and Newton's method corrects it in
+the plane normal to it, so that a fold, where the branch turns back in `s`, is an ordinary point. The tangent
+stiffness is factored as it is, indefinite or not; the number of its negative eigenvalues tells stability.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, unlock
+from jaxbeam.linear.layout import Layout, assemble, expand, gather
+from jaxbeam.scene.overlap import crossing
+from jaxbeam.scene.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
+from jaxbeam.solve.equilibrium import equilibrium
+from jaxbeam.solve.newton import Newton, check_asked, force_round_off, relative_residual, row_magnitudes, topology
+from jaxbeam.solve.solution import Status, check
+from jaxbeam.study.stability import lowest_mode
+
+# Corrections per step; a step that needs more than a few is followed by a shorter one.
+MAX_CORRECTIONS = 12
+
+
+EASY = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Critical:
+    """A point where an eigenvalue of the tangent stiffness is zero.
+
+    kind: `"fold"`, where the branch turns back, or `"bifurcation"`, where another branch crosses it.
+    parameter: `s` there. ratios: `(m,)` command there. x: `(n, 2)` positions. shape: `(n, 2)` the mode.
+    eigenvalue: what is left of it (zero but for round-off). after: index of the branch's point before it.
+    """
+
+    kind: str
+    parameter: float
+    ratios: np.ndarray
+    x: jax.Array
+    shape: jax.Array
+    eigenvalue: float
+    after: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Branch:
+    """A traced branch of `P` equilibria.
+
+    parameter: `(P,)` position `s` on the way from ratio 1 to the command. ratios: `(P, m)`. x: `(P, n, 2)`.
+    negative: `(P,)` negative eigenvalues of the tangent stiffness; stable where it is 0.
+    residual: `(P,)` relative, as in `Solution`. smallest_jacobian: `(P,)`.
+    overlapping: `(P,)` booleans, true where the body passes through itself.
+    critical: the folds and bifurcations on it, in order.
+    ended: why it ends: `"left"` (the interval), `"points"` (as many as allowed) or `"step"` (it could not go on).
+    """
+
+    parameter: np.ndarray
+    ratios: np.ndarray
+    x: np.ndarray
+    negative: np.ndarray
+    residual: np.ndarray
+    smallest_jacobian: np.ndarray
+    overlapping: np.ndarray
+    critical: tuple[Critical, ...]
+    ended: str
+
+    @property
+    def stable(self) -> np.ndarray:
+        """`(P,)` booleans."""
+        return self.negative == 0
+
+
+class Point(NamedTuple):
+    """A point on a branch: positions, parameter, unit tangent in both, and what is known of it."""
+
+    x: jax.Array
+    s: jax.Array
+    dx: jax.Array
+    ds: jax.Array
+    negative: jax.Array
+    residual: jax.Array
+    corrections: jax.Array
+
+
+@usual_rules
+def trace_branch(
+    scene: Scene,
+    ratios: Numbers,
+    *,
+    x0: Numbers | None = None,
+    parameter: float = 0.0,
+    direction: int = 1,
+    interval: tuple[float, float] = (0.0, 1.0),
+    step: float = 0.02,
+    max_points: int = 1000,
+    solver: Newton = Newton(),
+    progress: Callable[[int, float], None] | None = None,
+) -> Branch:
+    """Follow one branch of equilibria of the commands `1 + s (ratios - 1)`, through its folds.
+
+    It runs on the host, one jitted step after the other, and does not jump where a beam would.
+
+    Args:
+        scene: with `m` tendons.
+        ratios: `(m,)` the command at `s = 1`.
+        x0: `(n, 2)` an equilibrium, or near one, to start at; by default the rest positions.
+        parameter: `s` of the start.
+        direction: `1` to start towards larger `s`, `-1` towards smaller.
+        interval: the branch is followed until `s` leaves it.
+        step: largest arclength of a step, in the measure `rms displacement / size` and `s` together.
+        max_points: where to stop at the latest.
+        solver: tolerance and linear solver.
+        progress: called with the number of points and `s` after each step.
+
+    Returns:
+        A `Branch`.
+
+    Raises:
+        ValueError: as `command` does, or if an argument is out of its range.
+        EquilibriumError: if there is no equilibrium at the start.
+    """
+    check_asked(scene, solver)
+    if isinstance(direction, bool) or direction not in (1, -1):
+        raise ValueError(f"direction: expected 1 or -1, got {direction!r}")
+    step, parameter = checks.setting("step", step, checks.POSITIVE), checks.setting("parameter", parameter)
+    low, high = checks.numbers("interval", interval, shapes=((2,),)).tolist()
+    if not low <= parameter <= high or not low < high:
+        raise ValueError(
+            f"expected interval[0] <= parameter <= interval[1], got interval {interval!r}, parameter {parameter!r}"
+        )
+    checks.count("max_points", max_points, 1)
+    dtype = scene.mesh.nodes.dtype
+    command(scene, ratios)  # checks the ratios
+    end = jnp.asarray(ratios, dtype)
+    layout = solver.linear.layout(topology(scene))
+    begin = dataclasses.replace(solver, escape=False)
+    at_start = command(scene, 1 + parameter * (end - 1))
+    found = equilibrium(at_start, x0, begin)
+    # A saddle, a critical point or a body that overlaps itself lies on a branch as well as any other state.
+    if found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID):
+        check(found)
+    data = unlock(scene)
+    advance = partial(_advance, data, layout, end, solver=solver)
+    zero = jnp.zeros_like(found.x)
+    here = Point(found.x, jnp.asarray(parameter, dtype), zero, jnp.asarray(direction, dtype), *3 * [jnp.zeros((), int)])
+    points = [advance(here, jnp.zeros((), dtype))]
+    critical: list[Critical] = []
+    length, ended = step, "points"
+    while len(points) < max_points:
+        old, new = points[-1], advance(points[-1], jnp.asarray(length, dtype))
+        if not float(new.residual) <= solver.tolerance(dtype) or _strays(old, new, length, float(extent(scene))):
+            length /= 2
+            # Also where the step is infinite, and half of it as well.
+            if not length > 1e-6 * step:
+                ended = "step"
+                break
+            continue
+        if int(new.negative) != int(old.negative):
+            critical.append(_locate(scene, end, advance, old, new, length, len(points) - 1, solver))
+        points.append(new)
+        if int(new.corrections) <= EASY:
+            length = min(1.5 * length, step)
+        if progress is not None:
+            progress(len(points), float(new.s))
+        if not low <= float(new.s) <= high:
+            ended = "left"
+            break
+    stack = lambda name: np.stack([np.asarray(getattr(p, name)) for p in points])
+    s, x = stack("s"), stack("x")
+    return Branch(
+        parameter=s,
+        ratios=1 + s[:, None] * (np.asarray(end) - 1),
+        x=x,
+        negative=stack("negative"),
+        residual=stack("residual"),
+        smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(scene, y))(jnp.asarray(x))),
+        overlapping=np.asarray(lax.map(lambda y: crossing(scene, y)[0, 0] >= 0, jnp.asarray(x))),
+        critical=tuple(critical),
+        ended=ended,
+    )
+
+
+# How far a point may lie off the tangent it was predicted along, over the step, and the least cosine between the
+# tangents of neighbours. Wider limits let a step jump to another branch.
+MAX_OFFSET = 0.1
+
+
+MIN_COSINE = 0.9
+
+
+def _strays(old: Point, new: Point, length: float, size: float) -> bool:
+    """Whether a step has left the old tangent so far that the new point may be on another branch."""
+    weight = 1 / (new.x.size * size**2)
+    offset = weight * jnp.sum((new.x - old.x - length * old.dx) ** 2) + (new.s - old.s - length * old.ds) ** 2
+    cosine = weight * jnp.sum(new.dx * old.dx) + new.ds * old.ds
+    return bool((jnp.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
+
+
+@partial(jax.jit, static_argnames="solver")
+def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: jax.Array, solver: Newton) -> Point:
+    """The point of the branch at `length` along the tangent of `here`."""
+    rtol = solver.tolerance(here.x.dtype)
+    # Inner product of displacements: mean square over the body's size.
+    weight = 1 / (here.x.size * extent(scene) ** 2)
+
+    def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Steps to balance at fixed s, and with s; residual and inertia."""
+        scene_at = lambda s: command(scene, 1 + s * (end - 1))
+        at = evaluate(scene_at(s), x)
+        hessians = stencil_hessians(scene_at(s), x)
+        storage = assemble(layout, hessians)
+        rate = jax.jvp(lambda s: evaluate(scene_at(s), x).gradient, (s,), (jnp.ones_like(s),))[1]
+        factor, negative = solver.linear.factor_indefinite(layout, storage)
+        gradient = gather(layout, at.gradient)
+        solve = lambda v: expand(layout, -solver.linear.solve_indefinite(layout, factor, v), x.shape)
+        residual = relative_residual(scene, at, force_round_off(row_magnitudes(scene, hessians), x), rtol)
+        return solve(gradient), solve(gather(layout, rate)), residual, negative
+
+    def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:
+        point, _ = carry
+        balance, along, residual, negative = linearise(point.x, point.s)
+        miss = weight * jnp.sum(here.dx * (point.x - here.x)) + here.ds * (point.s - here.s) - length
+        ds = -(miss + weight * jnp.sum(here.dx * balance)) / (here.ds + weight * jnp.sum(here.dx * along))
+        norm = jnp.sqrt(weight * jnp.sum(along**2) + 1)
+        sign = jnp.sign(here.ds + weight * jnp.sum(here.dx * along))
+        done = (residual <= rtol) & (jnp.abs(miss) <= 1e-6 * jnp.abs(length) + jnp.finfo(length.dtype).eps * 100)
+        moved = Point(
+            x=jnp.where(done, point.x, point.x + balance + ds * along),
+            s=jnp.where(done, point.s, point.s + ds),
+            dx=sign * along / norm,
+            ds=sign / norm,
+            negative=negative,
+            residual=residual,
+            corrections=point.corrections + ~done,
+        )
+        return moved, done
+
+    guess = Point(
+        here.x + length * here.dx, here.s + length * here.ds, here.dx, here.ds,
+        jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, here.x.dtype), jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+    going = lambda carry: ~carry[1] & (carry[0].corrections <= MAX_CORRECTIONS)
+    point, done = lax.while_loop(going, correct, (guess, jnp.asarray(False)))
+    return point._replace(residual=jnp.where(done, point.residual, jnp.inf))
+
+
+def _locate(
+    scene: Scene,
+    end: jax.Array,
+    advance: Callable[[Point, jax.Array], Point],
+    old: Point,
+    new: Point,
+    length: float,
+    after: int,
+    solver: Newton,
+) -> Critical:
+    """The critical point between two neighbours: the root, along the branch, of the eigenvalue that changes sign.
+
+    Regula falsi with the Illinois rule (Dowell and Jarratt 1971).
+    """
+    which = min(int(old.negative), int(new.negative))
+
+    def eigen(point: Point) -> tuple[float, jax.Array]:
+        modes = lowest_mode(command(scene, 1 + point.s * (end - 1)), point.x, which + 1, solver)
+        return float(modes.values[which]), modes.shapes[which]
+
+    low, high = 0.0, length
+    point, (f_low, _), (f_high, shape) = new, eigen(old), eigen(new)
+    scale, side, value = max(abs(f_low), abs(f_high)), 0, f_high
+    for _ in range(60):
+        middle = (low * f_high - high * f_low) / (f_high - f_low)
+        point = advance(old, jnp.asarray(middle, old.s.dtype))
+        value, shape = eigen(point)
+        if abs(value) <= 1e-10 * scale or high - low <= 1e-13 * length:
+            break
+        if (value > 0) == (f_high > 0):
+            high, f_high = middle, value
+            f_low *= 0.5 if side == 1 else 1.0
+            side = 1
+        else:
+            low, f_low = middle, value
+            f_high *= 0.5 if side == -1 else 1.0
+            side = -1
+    ratios = np.asarray(1 + point.s * (end - 1))
+    kind = "fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation"
+    return Critical(kind, float(point.s), ratios, point.x, shape, value, after)

@@ -1,0 +1,99 @@
+"""The tendon beam by hand: linear beam theory, against which models are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.physics.materials import POISSON
+from jaxbeam.physics.tendon import check_law, inverse_square_stiffness
+
+# ------------------------------------------------------------------------------------ the hand calculation
+
+
+class Estimate(NamedTuple):
+    """What a hand calculation gives: `tip_angle` `()` in degrees, `lengths` and `tensions` `(2,)` of the tendons."""
+
+    tip_angle: jax.Array
+    lengths: jax.Array
+    tensions: jax.Array
+
+
+@usual_rules
+def euler_bernoulli(
+    ratios: Numbers,
+    length: Numbers = 3.5,
+    height: Numbers = 0.8,
+    young: Numbers = 1e4,
+    poisson: Numbers = 0.45,
+    tendon_modulus: Numbers = 2e3,
+    *,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+) -> Estimate:
+    """The tendon beam by hand: linear Euler-Bernoulli theory in plane strain, with eccentric tendons.
+
+    Over the half with tendons the axial strain `eps` and the curvature `kappa` are constant. With `a = length / 2`,
+    `e = +H/2` (top) and `-H/2` (bottom), tendon lengths `l = a (1 + eps - e kappa)` and tensions `T = k (l - l*)`,
+
+        E' H eps + sum T = 0,     E' H^3/12 kappa - sum e T = 0,     E' = E / (1 - nu^2):
+
+    two linear equations. The other half stays straight, so the tip rises by `kappa a^2 / 2 + kappa a a`.
+
+    Args:
+        ratios: `(2,)` of the top and the bottom tendon.
+        length: of the beam.
+        height: of the beam.
+        young: Young's modulus, scalar. (1e4, 0.45) in `macklin_mueller` is (9962, 0.4444) at small strain.
+        poisson: Poisson's ratio, scalar.
+        tendon_modulus: scalar or `(2,)`.
+        stiffness: the law of the tendons, see `tendons`.
+
+    Returns:
+        An `Estimate`, differentiable in every real argument.
+
+    Raises:
+        ValueError: if an argument has another shape or a concrete one is outside its range, which is that of
+            `rod_beam`. Where a traced one is, the answer is NaN.
+    """
+    values = (
+        checks.numbers("ratios", ratios, checks.POSITIVE, ((2,),), "of the top and the bottom tendon"),
+        checks.number("length", length, checks.POSITIVE),
+        checks.number("height", height, checks.POSITIVE),
+        checks.number("young", young, checks.POSITIVE),
+        checks.number("poisson", poisson, POISSON),
+        checks.numbers("tendon_modulus", tendon_modulus, checks.POSITIVE, ((), (2,))),
+    )
+    check_law(stiffness)
+    xp = namespace(*values)
+    return _by_hand(*(xp.asarray(value) for value in values), stiffness)
+
+
+@partial(jax.jit, static_argnames="stiffness")
+def _by_hand(
+    ratios: jax.Array,
+    length: jax.Array,
+    height: jax.Array,
+    young: jax.Array,
+    poisson: jax.Array,
+    tendon_modulus: jax.Array,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array],
+) -> Estimate:
+    """`euler_bernoulli` of arrays."""
+    half, plane = 0.5 * length, young / (1 - poisson**2)
+    commanded = ratios * half
+    k = stiffness(tendon_modulus, commanded)
+    # Tensions are k (a - l* + a rows . (eps, kappa)).
+    rows = jnp.stack([jnp.ones(2), height * jnp.array([-0.5, 0.5])], axis=1)
+    section = jnp.stack([plane * height, plane * height**3 / 12])
+    matrix = jnp.diag(section) + half * (rows.T * k) @ rows
+    stretch, curvature = jnp.linalg.solve(matrix, -rows.T @ (k * (half - commanded)))
+    lengths = half * (1 + rows @ jnp.stack([stretch, curvature]))
+    angle = jnp.rad2deg(jnp.arctan2(1.5 * curvature * half**2, length))
+    return Estimate(angle, lengths, k * (lengths - commanded))

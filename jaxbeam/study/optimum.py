@@ -1,0 +1,140 @@
+"""The derivative of a commanded answer: how what `reach` found moves with the target and the scene.
+
+The search is not differentiated. Its answer `theta` is a stationary point of a Lagrangian over the commands that no
+bound holds, with one multiplier `price` for each component of the measure (Nocedal and Wright 2006, section 12.3):
+
+    reached      L = 1/2 |theta - 1|^2 + price . (measure - target)
+    unreachable  L = 1/2 |measure - target|^2
+
+so by the implicit function theorem `z = (theta, price)` moves by `H dz = -d(grad L)`, with `H` the Hessian of `L` in
+`z`. Commands that a bound holds move with it. `L` contains the equilibrium, whose own derivative is implicit.
+
+The derivative is NaN where it does not exist or the theorem says nothing: where the search did not converge, where
+`H` is singular, and where a command lies at a bound that does not hold it, for it moves to one side only.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxbeam.core.derivative import custom_derivative
+from jaxbeam.core.tree import unlock
+from jaxbeam.linear.layout import LinearSolver, assemble
+from jaxbeam.scene.scene import command, stencil_hessians
+from jaxbeam.solve.equilibrium import differentiable
+from jaxbeam.solve.implicit import follow_scene
+from jaxbeam.solve.newton import Newton
+from jaxbeam.solve.solution import Solution
+from jaxbeam.study.search import REST, Measure, Problem
+
+
+class Answer(NamedTuple):
+    """What a search found.
+
+    theta: `(m,)` commands. x: `(n, 2)` their equilibrium. held: `(m,)` the bounds that hold, as in `Design`.
+    reached: `()` whether the target is met. trusted: `()` whether the search converged, to an equilibrium.
+    """
+
+    theta: jax.Array
+    x: jax.Array
+    held: jax.Array
+    reached: jax.Array
+    trusted: jax.Array
+    factor: Any = None
+
+
+def move_answer(
+    measure: Measure, solver: Newton, problem: Problem, target: jax.Array, answer: Answer, solution: Solution
+) -> tuple[jax.Array, Solution, jax.Array]:
+    """Commands, solution and value of an answer as functions of the problem and the target."""
+    # Equal bounds hold a command whatever it would gain without them.
+    held = jnp.where(problem.low == problem.high, 1, answer.held)
+    still = lax.stop_gradient(unlock(command(problem.scene, answer.theta)))
+    # XLA drops it where nothing is differentiated.
+    storage = assemble(problem.layout, stencil_hessians(still, answer.x))
+    answer = answer._replace(held=held, factor=solver.linear.factor(problem.layout, storage)[0])
+    theta, _ = follow_optimum(measure, solver.linear, problem, jnp.ravel(target), answer)
+    scene = command(problem.scene, theta)
+    moved = differentiable(unlock(scene), problem.layout, solution, answer.factor, solver)
+    return theta, moved, measure(scene, moved.x)
+
+
+@partial(custom_derivative, static=2)
+def follow_optimum(
+    measure: Measure, linear: LinearSolver, problem: Problem, target: jax.Array, answer: Answer
+) -> tuple[jax.Array, jax.Array]:
+    """`theta` `(m,)` of the answer itself and the multipliers `(p,)`, which move with the problem and the target
+    `(p,)`. The tangents of the answer are ignored."""
+    slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
+    slope = jnp.where(answer.held == 0, slope, 0)
+    gram = slope @ slope.T
+    price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ (1 - answer.theta))
+    return answer.theta, jnp.where(answer.reached & answer.trusted, price, 0)
+
+
+def _outcome(measure: Measure, linear: LinearSolver, problem: Problem, theta: jax.Array, answer: Answer) -> jax.Array:
+    """The measure `(p,)` at commands `theta`."""
+    scene = command(problem.scene, theta)
+    x = follow_scene(linear, unlock(scene), problem.layout, answer.x, answer.factor, answer.trusted)
+    return jnp.ravel(measure(scene, x))
+
+
+@follow_optimum.defjvp
+def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    problem, target, answer = primals
+    problem_dot, target_dot, _ = tangents
+    m, p = answer.theta.size, target.size
+    theta, price = follow_optimum(measure, linear, *primals)
+    # The slope of a bad answer is NaN: kept out of second derivatives that do not look at it.
+    theta = jnp.where(answer.trusted, theta, answer.theta)
+    price = jnp.where(answer.trusted, price, 0)
+    at = jnp.concatenate([theta, price])
+    held = jnp.append((answer.held != 0) & answer.trusted, jnp.zeros(p, bool))
+    bound_dot = jnp.where(answer.held < 0, problem_dot.low, problem_dot.high)
+    carried = jnp.where(held, jnp.append(bound_dot, jnp.zeros(p, theta.dtype)), 0)
+
+    def lagrangian(problem: Problem, target: jax.Array, z: jax.Array) -> jax.Array:
+        theta, price = z[:m], z[m:]
+        miss = _outcome(measure, linear, problem, theta, answer) - target
+        effort = 0.5 * jnp.sum((1 - theta) ** 2) + price @ miss
+        return jnp.where(answer.reached, effort, 0.5 * jnp.sum(miss**2) + 0.5 * jnp.sum(price**2))
+
+    slope = jax.grad(lagrangian, argnums=2)
+
+    def product(v: jax.Array) -> jax.Array:
+        """The Hessian of the Lagrangian over what is free; the unit matrix over what a bound holds."""
+        moved = jax.jvp(partial(slope, problem, target), (at,), (jnp.where(held, 0, v),))[1]
+        return jnp.where(held, v, moved)
+
+    hessian = lax.stop_gradient(jax.vmap(product)(jnp.eye(m + p, dtype=at.dtype)))
+    scale = _scales(hessian, held, answer.reached, m)
+    scaled = hessian * scale[:, None] * scale
+    values, vectors = jnp.linalg.eigh(scaled)
+    small = jnp.sqrt(jnp.finfo(at.dtype).eps)
+    sound = jnp.min(jnp.abs(values)) > small * jnp.max(jnp.abs(values))
+    # At a bound that does not hold it, and with something to gain or to lose by leaving it.
+    weak = (answer.held == 0) & ((theta - problem.low <= REST) | (problem.high - theta <= REST))
+    coupled = jnp.max(jnp.abs(scaled - jnp.diag(jnp.diagonal(scaled))), axis=1) > small
+    sound &= ~jnp.any(weak & coupled[:m])
+
+    def solve(_: Any, b: jax.Array) -> jax.Array:
+        y = scale * (vectors @ ((vectors.T @ (scale * b)) / values))
+        return jnp.where(answer.trusted & sound, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(b.dtype))
+
+    pull = jax.jvp(slope, (problem, target, at), (problem_dot, target_dot, carried))[1]
+    moved = lax.custom_linear_solve(product, -jnp.where(held, 0, pull), solve, symmetric=True) + carried
+    return (theta, price), (moved[:m], moved[m:])
+
+
+def _scales(hessian: jax.Array, held: jax.Array, reached: jax.Array, m: int) -> jax.Array:
+    """What each unknown `(m + p,)` is multiplied by, so that the Hessian has no unit and its entries are about 1."""
+    norm = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=-1))
+    inverse = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+    curvature = jnp.max(jnp.abs(jnp.where(held[:m, None], 0, hessian[:m, :m])))
+    commands = jnp.where(reached | held[:m], 1, inverse(jnp.sqrt(curvature)))
+    return jnp.append(commands, jnp.where(reached, inverse(norm(hessian[m:, :m])), 1))
