@@ -12,6 +12,8 @@ those of Okabe and Ito (2008), which survive colour blindness; several curves al
 from jaxbeam.plot.animations import animate_beams as animate_beams
 from jaxbeam.plot.animations import animate_ramp as animate_ramp
 from jaxbeam.plot.animations import save_animation as save_animation
+from jaxbeam.plot.drawing import MARKERS as MARKERS
+from jaxbeam.plot.drawing import PALETTE as PALETTE
 from jaxbeam.plot.drawing import limits as limits
 from jaxbeam.plot.states import States as States
 from jaxbeam.plot.stills import beam as beam

@@ -106,7 +106,8 @@ def rod_beam(
         poisson: Poisson's ratio, scalar or one for each element; `lame` turns both into Lame parameters.
         tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
         density: the material, see `jaxbeam.physics.materials`. As in `tendon_beam`, (1e4, 0.45) behaves as (9962,
-            0.4444) in the default, and as it says in `neo_hookean`. `linear_elastic` makes Simo's rod, linear in its strains.
+            0.4444) in the default, and as it says in `neo_hookean`. `linear_elastic` makes Simo's rod, linear in its
+            strains.
         stiffness: the law of the tendons, see `tendons`.
         dtype: of everything computed; by default JAX's float.
 

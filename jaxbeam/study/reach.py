@@ -63,8 +63,8 @@ def reach(
     `theta`, `solution` (as that of `equilibrium`), `value` and `loss` are differentiable in `target`, `bounds` and
     every float of the scene, forward, reverse and to any order, by the conditions that an optimum satisfies (see
     `jaxbeam.study.optimum`); not in `starts`. `history` is a record and does not move. The derivative is NaN where the
-    status is `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold it,
-    for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
+    status is `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold
+    it, for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
 
     Raises:
         ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.

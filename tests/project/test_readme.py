@@ -12,7 +12,7 @@ import pytest
 
 import jaxbeam as jb
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
 def test_code_runs_as_printed():
@@ -34,7 +34,7 @@ def test_set_up_commands_are_two():
 
 def test_picture_exists():
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", README):
-        assert (Path(__file__).parent.parent / picture).stat().st_size > 10_000
+        assert (Path(__file__).parents[2] / picture).stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

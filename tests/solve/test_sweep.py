@@ -143,7 +143,7 @@ def test_partition_is_of_near_ones():
 @pytest.mark.slow
 def test_processes_change_nothing(tmp_path):
     """The example on one process and on two: the same results to the last bit."""
-    script = Path(__file__).parents[1] / "examples" / "09_sweep_many.py"
+    script = Path(__file__).parents[2] / "examples" / "09_sweep_many.py"
 
     def start(*more):
         command = [sys.executable, str(script), "--out", str(tmp_path), "--side", "18", *more]

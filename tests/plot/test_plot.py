@@ -19,9 +19,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxbeam as jb
-from jaxbeam import measures, plot
+from jaxbeam import plot
 from jaxbeam.mesh.surface import patch, surface
 from jaxbeam.physics.energy import Term
+from jaxbeam.plot.animations import HOLD
+from jaxbeam.plot.lines import outline
 
 STEPS = 5
 
@@ -128,7 +130,7 @@ def test_tendon_runs_through_its_guides(scene):
 
 
 def test_boundary_is_the_outline_with_the_body_on_the_left(scene):
-    edges = plot.outline(scene)
+    edges = outline(scene)
     assert len(edges) == 2 * (6 + 2)
     start, end = np.asarray(scene.mesh.nodes)[edges.T]
     twice_area = np.sum(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
@@ -222,7 +224,7 @@ def test_gif_has_every_frame_and_rests_on_the_last(states, tmp_path):
         for frame in range(STEPS):
             image.seek(frame)
             durations.append(image.info["duration"])
-    assert durations == [100] * (STEPS - 1) + [100 * plot.HOLD]
+    assert durations == [100] * (STEPS - 1) + [100 * HOLD]
 
 
 def test_saving_names_the_cure(states, tmp_path, monkeypatch):
@@ -460,7 +462,7 @@ def test_rod_in_animations_galleries_and_fields(rod):
 # ------------------------------------------------------------------------------------- stress at nodes
 
 
-nodal_stress = jax.jit(measures.nodal_stress)
+nodal_stress = jax.jit(jb.nodal_stress)
 
 
 def block(n=1, degree=None, density=jb.neo_hookean):
