@@ -34,7 +34,7 @@ class Line(Mesh):
 
     nodes: jax.Array
     elements: np.ndarray = index_field()
-    radian: jax.Array
+    radian: jax.Array  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         nodes = float_nodes(self.nodes, 3, "(x, y, radian * angle)")
@@ -110,3 +110,17 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     unit = np.linspace(-0.5, 0.5, nodes)[:, None] * [1.0, 0.0, 0.0]
     pairs = np.stack([np.arange(nodes - 1), np.arange(1, nodes)], axis=1)
     return Line(unit.astype(dtype) * namespace(length).asarray(length, dtype), pairs, to_device(radian, dtype))
+
+
+def beside(x: Any, offset: Any, radian: Any) -> Any:
+    """Points `(..., k, 2)` beside the nodes `x` `(..., k, 3)` of a line: `(x - e sin theta, y + e cos theta)`.
+
+    Args:
+        x: positions of the nodes.
+        offset: `e` `(..., k)`, along the section to the left of the axis.
+        radian: `(...)` as in `Line`.
+    """
+    xp = namespace(x, offset, radian)
+    theta = x[..., 2] / radian[..., None]
+    normal = xp.stack([-xp.sin(theta), xp.cos(theta)], axis=-1)
+    return x[..., :2] + offset[..., None] * normal

@@ -7,7 +7,7 @@ are in the user's unit. Everything is checked here, on the host, once; what foll
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,8 @@ class Mesh:
 
     nodes: jax.Array
     elements: np.ndarray = index_field()
+    # A length, on the line of a rod: its nodes have a third coordinate, this times an angle.
+    radian: ClassVar[Any] = None
 
     def __post_init__(self) -> None:
         elements = checks.whole_numbers("elements", self.elements, "(t, 3) or (t, 6)", (3, 6))

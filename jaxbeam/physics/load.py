@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace, pytree
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.mesh import Mesh
-from jaxbeam.physics.energy import Term, check_nodes
-
-# ---------------------------------------------------------------------------------- loads and springs
+from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 
 @pytree
 class PointParams:
-    """Rest position `(m, 2)` and a vector or scalar `value` for each loaded node."""
+    """Of each loaded node: its rest position, and the load or the stiffness.
+
+    rest: `(m, d)`.
+    value: `(m, d)` force, or `(m,)` stiffness.
+    """
 
     rest: jax.Array
     value: jax.Array
 
 
-def dead_load_energy(x: jax.Array, params: PointParams) -> jax.Array:
+@dataclasses.dataclass(frozen=True)
+class DeadLoadEnergy(Energy):
     """`-f . (x - X)`: a force of constant size and direction on one node."""
-    return -jnp.sum(params.value * (x[0] - params.rest))
+
+    name: ClassVar[str] = "load"
+
+    def __call__(self, x: jax.Array, params: PointParams) -> jax.Array:
+        return -jnp.sum(params.value * (x[0] - params.rest))
+
+    def partway(self, params: PointParams, share: jax.Array) -> PointParams:
+        return replace(params, value=share * params.value)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        return term
 
 
 @usual_rules
@@ -35,7 +51,7 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
         mesh: its rest positions are the zero of the load's energy.
         nodes: `(m,)` node numbers.
         force: `(2,)` on each of them, or `(m, 2)`; on a rod `(3,)` or `(m, 3)`, the third a moment over `radian`
-            (see `jaxbeam.rod`); differentiable.
+            (see `jaxbeam.mesh.line`); differentiable.
 
     Raises:
         ValueError: if a node is out of range or `force` has another shape or is not finite.
@@ -45,4 +61,4 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     force = checks.numbers("force", force, shapes=((d,), (where.size, d)))
     xp, rest = namespace(force), namespace(mesh.nodes).asarray(mesh.nodes)[where]
     values = xp.broadcast_to(xp.asarray(force, mesh.nodes.dtype), (where.size, d))
-    return Term(dead_load_energy, where[:, None], PointParams(rest, values))
+    return Term(DeadLoadEnergy(), where[:, None], PointParams(rest, values))

@@ -68,6 +68,14 @@ def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:
     return Lame(plain.mu, plain.lam + plain.mu)
 
 
+def material_is_valid(material: Any) -> Any:
+    """Whether traced parameters of a material are in their range `()`: those of `lame`; of others nothing is known."""
+    if not isinstance(material, Lame):
+        return True
+    # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
+    return jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
+
+
 def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
     """Stable neo-Hookean, `mu/2 (|F|^2 - 2) - mu (J - 1) + lam/2 (J - 1)^2`.
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,9 +36,10 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, namespace, pytree
-from jaxbeam.mesh.line import Line
-from jaxbeam.physics.energy import Term
-from jaxbeam.physics.materials import check_density, macklin_mueller
+from jaxbeam.mesh.line import Line, beside
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.physics.energy import Energy, NotRefinable, Term
+from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
 
 # Reissner's shear coefficient of a rectangular section.
 SHEAR = 5 / 6
@@ -66,14 +67,31 @@ class RodParams:
 
 
 @dataclasses.dataclass(frozen=True)
-class RodEnergy:
-    """Energy of one element of two nodes; the strains are those at its middle. One point, and not two, lets a thin
-    element bend without shear: it does not lock (Simo and Vu-Quoc 1986). Hashable, so never retraced."""
+class RodEnergy(Energy):
+    """Energy of one element of two nodes; the strains are those at its middle.
+
+    One point, and not two, lets a thin element bend without shear: it does not lock (Simo and Vu-Quoc 1986). What must
+    stay positive is the stretch of its fibres.
+    """
 
     density: Callable[[jax.Array, Any], jax.Array]
+    body: ClassVar[bool] = True
+    coordinates: ClassVar[int | None] = 3
 
     def __call__(self, x: jax.Array, params: RodParams) -> jax.Array:
         return _element_energy(self.density, x, params)
+
+    def valid(self, params: RodParams) -> jax.Array:
+        return jnp.all((params.height > 0) & (params.radian > 0)) & material_is_valid(params.material)
+
+    def margin(self, x: jax.Array, params: RodParams) -> jax.Array:
+        return jnp.min(jax.vmap(fibre_stretches)(x, params), axis=1)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        raise NotRefinable("a rod has the error of its model, which no finer mesh shows")
+
+    def sides(self, x: jax.Array, params: RodParams) -> list[jax.Array]:
+        return [beside(x, jnp.tile(half * params.height[:, None], 2), params.radian) for half in (0.5, -0.5)]
 
 
 # Jitted, so that it is traced once for all of its derivatives.

@@ -2,35 +2,55 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
-from jaxbeam.mesh.line import Line
-from jaxbeam.physics.energy import Term
-from jaxbeam.physics.tendon import TendonEnergy, inverse_square_stiffness, polyline_length, tendons
-
-# -------------------------------------------------------------------------------------------- tendons
+from jaxbeam.mesh.line import Line, beside
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.physics.energy import NotRefinable, Term
+from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, polyline_length, tendons
 
 
 @pytree
 class Offsets:
-    """Where the points of tendons are: `eccentricity` `(m, k)` along the section from its node, to the left of the
-    axis, and `radian` `(m,)` as in `Line`."""
+    """Where the points of tendons lie.
+
+    eccentricity: `(m, k)` along the section from its node, to the left of the axis.
+    radian: `(m,)` as in `Line`.
+    """
 
     eccentricity: jax.Array
     radian: jax.Array
 
 
 def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
-    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`: `(x - e sin theta, y + e cos theta)`."""
-    xp = namespace(x, attachment.eccentricity, attachment.radian)
-    theta = x[..., 2] / attachment.radian[..., None]
-    normal = xp.stack([-xp.sin(theta), xp.cos(theta)], axis=-1)
-    return x[..., :2] + attachment.eccentricity[..., None] * normal
+    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`."""
+    return beside(x, attachment.eccentricity, attachment.radian)
+
+
+@dataclasses.dataclass(frozen=True)
+class RodTendonEnergy(TendonEnergy):
+    """A tendon whose points lie beside the nodes of a rod, on their sections."""
+
+    points: Callable[[jax.Array, Any], jax.Array] = at_offsets
+    coordinates: ClassVar[int | None] = 3
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        raise NotRefinable("it is tied to the sections of a rod")
+
+    def without_limit(self, term: Term, free: np.ndarray) -> str:
+        return ""
+
+    def arms(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        return jnp.stack([x[..., :2], self.line(x, params)], axis=-2)
 
 
 @usual_rules
@@ -66,7 +86,7 @@ def rod_tendons(
     )
     natural = polyline_length(at_offsets(xp.asarray(line.nodes)[plain.nodes], offsets))
     return Term(
-        TendonEnergy(stiffness, at_offsets),
+        RodTendonEnergy(stiffness),
         plain.nodes,
         replace(plain.params, natural=natural, commanded=natural, attachment=offsets),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,47 +12,71 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace, pytree
-from jaxbeam.mesh.elements import rule, shape_slopes
+from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.mesh.elements import degree_of, rule, shape_slopes
 from jaxbeam.mesh.mesh import Mesh, check_triangles
-from jaxbeam.physics.energy import Term
-from jaxbeam.physics.materials import check_density, macklin_mueller
+from jaxbeam.physics import quadrature
+from jaxbeam.physics.energy import Energy, Term
+from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
+from jaxbeam.physics.quadrature import Density, SolidParams
+from jaxbeam.physics.volume import admissible_step, rest_is_sound, smallest_ratios
 
-# ---------------------------------------------------------------------------------------------- solid
-
-
-@pytree
-class SolidParams:
-    """Parameters of elements with `k` nodes and `q` quadrature points (leading axis `m` in a `Term`).
-
-    rest `(m, k, 2)`: rest positions. gradients `(m, q, k, 2)`: shape-function gradients in the rest frame.
-    weights `(m, q)`: quadrature weight times rest area. material: pytree with leading axis `m`.
-    """
-
-    rest: jax.Array
-    gradients: jax.Array
-    weights: jax.Array
-    material: Any
+# An element under this `J` is let through zero, where its energy allows that: held back, it would be approached in ever
+# smaller steps. It may well come back, and if it does not, the solution says so. Away from the quadrature points every
+# energy allows it.
+RELEASED = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class SolidEnergy:
-    """Energy of one element: the density summed over its quadrature points. Hashable, so never retraced."""
+class SolidEnergy(Energy):
+    """Energy of one element: the density summed over its quadrature points. What must stay positive is `J`."""
 
-    density: Callable[[jax.Array, Any], jax.Array]
+    density: Density
+    body: ClassVar[bool] = True
+    fills: ClassVar[bool] = True
+    coordinates: ClassVar[int | None] = 2
 
     def __call__(self, x: jax.Array, params: SolidParams) -> jax.Array:
         densities = jax.vmap(lambda H: self.density(H, params.material))(displacement_gradients(x, params))
         return jnp.sum(params.weights * densities)
 
+    def gradients(self, x: jax.Array, params: SolidParams) -> tuple[jax.Array, jax.Array]:
+        return quadrature.energies_and_gradients(self.density, x, params)
 
-def forbids_inversion(energy: SolidEnergy, params: SolidParams) -> bool:
+    def hessians(self, x: jax.Array, params: SolidParams, convex: bool = False) -> jax.Array:
+        return quadrature.hessians(self.density, x, params, convex)
+
+    def valid(self, params: SolidParams) -> jax.Array:
+        return jnp.all(rest_is_sound(params)) & material_is_valid(params.material)
+
+    def margin(self, x: jax.Array, params: SolidParams) -> jax.Array:
+        return smallest_ratios(x, params)
+
+    def longest_step(self, x: jax.Array, dx: jax.Array, params: SolidParams, keep: float) -> jax.Array:
+        """Quadrature points of a density that forbids inversion always keep their share; all else only while `J` is
+        over `RELEASED`."""
+        bound = 0.0 if forbids_inversion(self.density, params) else RELEASED
+        return admissible_step(x, dx, params, keep, bound, RELEASED)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), parts, axis=0), term.params.material)
+        return solid(mesh, material, self.density, max(degree_of(term.params.weights.shape[1]), 2))
+
+    def at_points(self, x: jax.Array, params: SolidParams, measure: Callable[..., jax.Array]) -> jax.Array:
+        def one(x: jax.Array, params: SolidParams) -> jax.Array:
+            of_point = lambda H: measure(H, self.density, params.material)
+            return jax.vmap(of_point)(displacement_gradients(x, params))
+
+        return jax.vmap(one)(x, params)
+
+
+def forbids_inversion(density: Density, params: SolidParams) -> bool:
     """Whether the density is infinite or undefined for an inverted element, as a logarithmic one is."""
     ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
     inverted = np.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
     # That it may be NaN is what is asked.
     with jax.ensure_compile_time_eval(), jax.debug_nans(False):
-        return not np.isfinite(jax.jit(energy.density)(inverted, ones))
+        return not np.isfinite(jax.jit(density)(inverted, ones))
 
 
 def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
@@ -64,7 +88,7 @@ def displacement_gradients(x: jax.Array, params: SolidParams) -> jax.Array:
 def solid(
     mesh: Mesh,
     params: Any,
-    density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
+    density: Density = macklin_mueller,
     degree: int | None = None,
 ) -> Term:
     """The body itself.

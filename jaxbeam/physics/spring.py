@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -9,13 +12,24 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace
 from jaxbeam.mesh.mesh import Mesh
-from jaxbeam.physics.energy import Term, check_nodes
+from jaxbeam.physics.energy import Energy, Term, check_nodes
 from jaxbeam.physics.load import PointParams
 
 
-def penalty_energy(x: jax.Array, params: PointParams) -> jax.Array:
+@dataclasses.dataclass(frozen=True)
+class SpringEnergy(Energy):
     """`1/2 k |x - X|^2`: a spring from one node to its rest position."""
-    return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
+
+    name: ClassVar[str] = "spring"
+
+    def __call__(self, x: jax.Array, params: PointParams) -> jax.Array:
+        return 0.5 * params.value * jnp.sum((x[0] - params.rest) ** 2)
+
+    def valid(self, params: PointParams) -> jax.Array:
+        return jnp.all(params.value >= 0)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        return term
 
 
 @usual_rules
@@ -37,4 +51,4 @@ def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
     stiffness = checks.numbers("stiffness", stiffness, checks.NOT_NEGATIVE, ((), (where.size,)))
     xp, rest = namespace(stiffness), namespace(mesh.nodes).asarray(mesh.nodes)[where]
     values = xp.broadcast_to(xp.asarray(stiffness, mesh.nodes.dtype), (where.size,))
-    return Term(penalty_energy, where[:, None], PointParams(rest, values))
+    return Term(SpringEnergy(), where[:, None], PointParams(rest, values))

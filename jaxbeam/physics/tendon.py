@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,10 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree
+from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.surface import patch
-from jaxbeam.physics.energy import Term, check_nodes
+from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 # -------------------------------------------------------------------------------------------- tendons
 
@@ -79,24 +79,68 @@ def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class TendonEnergy:
+class TendonEnergy(Energy):
     """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its points, `l*` the
-    commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes."""
+    commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes.
+
+    Its command is the ratio `l*` over the natural length.
+    """
 
     stiffness: Callable[[jax.Array, jax.Array], jax.Array]
     points: Callable[[jax.Array, Any], jax.Array] = at_nodes
+    name: ClassVar[str] = "tendon"
+    coordinates: ClassVar[int | None] = 2
+    rest_command: ClassVar[float | None] = 1.0
+    commands: ClassVar[checks.Range] = checks.POSITIVE
+    command_hint: ClassVar[str] = "1 is the natural length and 0.5 half of it"
 
     def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:
         stretch = self.length(x, params) - params.commanded
         return 0.5 * self.stiffness(params.modulus, params.commanded) * stretch**2
 
     def length(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        """Present length `l`."""
+        """Present length `l` `()`."""
         return polyline_length(self.points(x, params.attachment))
 
     def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        """`dE/dl = k (l - l*)`, positive when it pulls."""
+        """`dE/dl = k (l - l*)` `()`, positive when it pulls."""
         return self.stiffness(params.modulus, params.commanded) * (self.length(x, params) - params.commanded)
+
+    def command(self, params: TendonParams, values: jax.Array) -> TendonParams:
+        natural = params.natural
+        commanded = namespace(values, natural).asarray(values, natural.dtype) * namespace(natural).asarray(natural)
+        return replace(params, commanded=to_device(commanded))
+
+    def command_of(self, params: TendonParams) -> jax.Array:
+        return params.commanded / params.natural
+
+    def partway(self, params: TendonParams, share: jax.Array) -> TendonParams:
+        return replace(params, commanded=(1 - share) * params.natural + share * params.commanded)
+
+    def valid(self, params: TendonParams) -> jax.Array:
+        return jnp.all((params.commanded > 0) & (params.modulus > 0))
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        params = term.params
+        if params.width is None:
+            return term
+        new = tendons(mesh, params.ends, params.modulus, self.stiffness, np.asarray(params.width))
+        params = replace(new.params, natural=params.natural, commanded=params.commanded)
+        return Term(self, new.nodes, params)
+
+    def without_limit(self, term: Term, free: np.ndarray) -> str:
+        if term.params.width is not None or not free[term.nodes].any():
+            return ""
+        return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+
+    def measured(self, x: jax.Array, params: TendonParams) -> dict[str, jax.Array]:
+        return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
+
+    def line(self, x: jax.Array, params: TendonParams) -> jax.Array:
+        return jax.vmap(self.points)(x, params.attachment)[..., :2]
+
+    def anchors(self, params: TendonParams) -> tuple[np.ndarray, np.ndarray] | None:
+        return None if params.ends is None else (params.ends, np.asarray(params.width))
 
 
 def polyline_length(x: jax.Array) -> jax.Array:

@@ -105,7 +105,7 @@ def _play(
     """Animate each of `states` on its axes; `trace` draws what else changes."""
     beams = [_Beam(ax, each.scene) for ax, each in zip(axes, states, strict=True)]
     pushing = [each.measure(_pushing) for each in states]
-    _legend(figure, pushing)
+    _legend(figure, [each.scene for each in states], pushing)
 
     def draw(frame: int) -> None:
         for ax, artists, each, push in zip(axes, beams, states, pushing, strict=True):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
@@ -14,9 +15,18 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from jaxbeam.core.tree import Numbers
-from jaxbeam.plot.lines import arms, edge_curves, elements_of, outline, patches, rings, tendon_points
-from jaxbeam.scene.measures import tendon_tensions
-from jaxbeam.scene.scene import Scene, placed, tendon_count
+from jaxbeam.plot.lines import (
+    arms,
+    drawn_terms,
+    edge_curves,
+    elements_of,
+    line_names,
+    outline,
+    patches,
+    rings,
+    term_lines,
+)
+from jaxbeam.scene.scene import Scene, placed
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
@@ -70,14 +80,14 @@ class _Beam:
     def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
         self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
         self.patches, self.shares, pulling = patches(scene)
-        self.rod = self.elements.shape[1] == 2
+        self.rod, self.names = scene.mesh.radian is not None, line_names(scene)
         rest = np.asarray(scene.mesh.nodes)
         dotted = {"colors": GHOST, "linewidths": 0.9, "linestyles": "dotted"}
         ghost = LineCollection(list(edge_curves(rest, self.edges)), label="at rest", zorder=1, **dotted)
         self.body = PolyCollection([], facecolor=BODY, edgecolor=MESH, linewidth=0.35, capstyle="round", zorder=2)
         width = 2.6 if self.rod else 0.9
         self.outline = LineCollection([], colors=OUTLINE, linewidths=width, capstyle="round", zorder=3)
-        colours = [tendon_colours[number % len(tendon_colours)] for number in range(tendon_count(scene))]
+        colours = [tendon_colours[number % len(tendon_colours)] for number in range(len(self.names))]
         # What tendons are held by, other than nodes: a patch of surface, or an arm of the rod.
         width = 0.9 if self.rod else 2.8
         self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
@@ -95,16 +105,20 @@ class _Beam:
         self.body.set_verts(around, closed=not self.rod)
         self.outline.set_segments(list(edge_curves(x, self.edges)))
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
-        paths = tendon_points(self.scene, x)
+        paths = term_lines(self.scene, x)
         self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
-        for number, (line, path, push) in enumerate(zip(self.tendons, paths, pushing, strict=True)):
+        for name, line, path, push in zip(self.names, self.tendons, paths, pushing, strict=True):
             line.set_data(*path.T)
-            line.set(linestyle=PUSHING if push else "-", label=f"tendon {number + 1}" + " (pushing)" * bool(push))
+            line.set(linestyle=PUSHING if push else "-", label=name + " (pushing)" * bool(push))
 
 
 def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
-    """`(m,)`: which tendons push. One at its commanded length, but for round-off, does neither."""
-    return tendon_tensions(scene, x.at[:, :2].multiply(1 + 1e-5)) < 0
+    """`(m,)`: which of the lines push. One at its commanded length, but for round-off, does neither."""
+    x, found = x.at[:, :2].multiply(1 + 1e-5), []
+    for term, lines in drawn_terms(scene):
+        tension = term.kind.measured(x[term.nodes], term.params).get("tension")
+        found.append(jnp.zeros(len(lines), bool) if tension is None else tension < 0)
+    return jnp.concatenate([*found, jnp.zeros(0, bool)])
 
 
 def _positions(scene: Scene, x: Numbers) -> np.ndarray:
@@ -168,10 +182,10 @@ def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
         ax.set_aspect("equal")
 
 
-def _legend(figure: Figure, pushing: Sequence[np.ndarray]) -> None:
-    """One legend below all panels; `pushing`, of each beam, is `(..., m)`: whether a tendon ever pushes."""
-    tendons = range(max(each.shape[-1] for each in pushing))
-    handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=f"tendon {k + 1}") for k in tendons]
+def _legend(figure: Figure, scenes: Sequence[Scene], pushing: Sequence[np.ndarray]) -> None:
+    """One legend below all panels; `pushing`, of each beam, is `(..., m)`: whether a line ever pushes."""
+    names = max((line_names(scene) for scene in scenes), key=len)
+    handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=name) for k, name in enumerate(names)]
     if any(each.any() for each in pushing):
         handles.append(Line2D([], [], color="0.3", lw=2, linestyle=PUSHING, label="pushing"))
     handles.append(Line2D([], [], color=GHOST, linestyle="dotted", label="at rest"))

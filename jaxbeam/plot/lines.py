@@ -6,14 +6,15 @@ Positions are `(n, 2)`, or `(n, 3)` for a rod, whose nodes also turn; of those t
 
 from __future__ import annotations
 
-import jax
+import itertools
+
 import numpy as np
 
 from jaxbeam.core.tree import Numbers
 from jaxbeam.mesh.elements import EDGES, shape_functions
 from jaxbeam.mesh.surface import surface, walk
-from jaxbeam.physics.tendon import TendonEnergy
-from jaxbeam.scene.scene import Scene, solid_terms, tendon_terms
+from jaxbeam.physics.energy import Term
+from jaxbeam.scene.scene import Scene
 
 # Points of a curved edge; an odd number, so that the node in the middle is one of them.
 POINTS = 9
@@ -21,13 +22,13 @@ POINTS = 9
 
 def elements_of(scene: Scene) -> np.ndarray:
     """`(t, k)` nodes of each element, in the order in which the measures number them."""
-    solids = [np.asarray(term.nodes) for term in solid_terms(scene)]
+    solids = [np.asarray(term.nodes) for term in scene.terms if term.kind.fills]
     return np.concatenate(solids) if solids else np.asarray(scene.mesh.elements)
 
 
 def outline(scene: Scene) -> np.ndarray:
     """The edges `(e, 2)` or `(e, 3)` of the surface, the body on their left; of a rod, those of its centre line."""
-    return np.asarray(scene.mesh.elements) if scene.mesh.elements.shape[1] == 2 else surface(scene.mesh)
+    return surface(scene.mesh) if scene.mesh.radian is None else np.asarray(scene.mesh.elements)
 
 
 def edge_curves(x: np.ndarray, edges: np.ndarray, shares: Numbers = 1.0) -> np.ndarray:
@@ -50,21 +51,31 @@ def rings(x: np.ndarray, elements: np.ndarray) -> np.ndarray:
     return shape_functions(nodes, around) @ x[elements, :2]
 
 
-def tendon_points(scene: Scene, x: np.ndarray) -> list[np.ndarray]:
-    """The points `(p, 2)` that each tendon runs through."""
+def drawn_terms(scene: Scene) -> list[tuple[Term, np.ndarray]]:
+    """The terms that are drawn as lines, and for each the number, over all of them, of each of its lines."""
+    x = np.asarray(scene.mesh.nodes)
+    drawn = [term for term in scene.terms if term.kind.line(x[term.nodes], term.params) is not None]
+    ends = np.cumsum([0, *(len(term.nodes) for term in drawn)])
+    return [(term, np.arange(*pair)) for term, pair in zip(drawn, itertools.pairwise(ends), strict=True)]
+
+
+def line_names(scene: Scene) -> list[str]:
+    """What to call each of the lines, such as `tendon 1`."""
+    return [f"{term.kind.name} {number + 1}" for term, lines in drawn_terms(scene) for number in lines]
+
+
+def term_lines(scene: Scene, x: np.ndarray) -> list[np.ndarray]:
+    """The points `(p, 2)` of each line that a term is drawn as, such as those that a tendon runs through."""
     found: list[np.ndarray] = []
-    for term in tendon_terms(scene):
-        assert isinstance(term.energy, TendonEnergy)
-        found += [*np.asarray(jax.vmap(term.energy.points)(x[term.nodes], term.params.attachment))[..., :2]]
+    for term, _ in drawn_terms(scene):
+        found += [*np.asarray(term.kind.line(x[term.nodes], term.params))]
     return found
 
 
 def arms(scene: Scene, x: np.ndarray) -> np.ndarray:
-    """Lines `(q, 2, 2)` from the nodes of a rod to the points beside it that its tendons run through."""
-    nodes = [each for term in tendon_terms(scene) for each in np.asarray(term.nodes)]
-    pairs = [(x[k, :2], points) for k, points in zip(nodes, tendon_points(scene, x), strict=True)]
-    found = [np.stack(pair, axis=1) for pair in pairs if len(pair[0]) == len(pair[1])]
-    return np.concatenate([np.zeros((0, 2, 2)), *found])
+    """Segments `(q, 2, 2)` from the body to points of lines that are not nodes, as beside a rod."""
+    found = [term.kind.arms(x[term.nodes], term.params) for term, _ in drawn_terms(scene)]
+    return np.concatenate([np.zeros((0, 2, 2)), *(np.reshape(each, (-1, 2, 2)) for each in found if each is not None)])
 
 
 def extremes(scene: Scene, states: np.ndarray) -> list[np.ndarray]:
@@ -72,7 +83,7 @@ def extremes(scene: Scene, states: np.ndarray) -> list[np.ndarray]:
     found, edges = [], outline(scene)
     for x in (np.asarray(scene.mesh.nodes), *states):
         # Curved edges bulge past their nodes, and the tendons of a rod run beside it.
-        found += [x[:, :2], edge_curves(x, edges), *tendon_points(scene, x)]
+        found += [x[:, :2], edge_curves(x, edges), *term_lines(scene, x)]
     return found
 
 
@@ -85,14 +96,14 @@ def patches(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     edges, rest = outline(scene), np.asarray(scene.mesh.nodes)
     found: list[tuple[list[int], float, int]] = []
-    first = 0
-    for term in tendon_terms(scene):
-        if term.params.ends is not None:
-            anchors = [np.ravel(each) for each in (term.params.ends, term.params.width)]
-            numbers = first + np.repeat(np.arange(len(term.nodes)), term.params.ends.shape[1])
-            for node, width, number in zip(*anchors, numbers, strict=True):
-                found += [(line, share, number) for line, _, _, share in walk(rest, edges, int(node), float(width))]
-        first += len(term.nodes)
+    for term, lines in drawn_terms(scene):
+        anchors = term.kind.anchors(term.params)
+        if anchors is None:
+            continue
+        each = [np.ravel(entries) for entries in anchors]
+        numbers = np.repeat(lines, anchors[0].shape[1])
+        for node, width, number in zip(*each, numbers, strict=True):
+            found += [(line, share, number) for line, _, _, share in walk(rest, edges, int(node), float(width))]
     columns = zip(*found, strict=True) if found else ([], [], [])
     reached, shares, numbers = (np.array(column) for column in columns)
     return reached.astype(int).reshape(-1, edges.shape[1]), shares, numbers.astype(int)

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.tree import Numbers
-from jaxbeam.scene.scene import Scene, command, tendon_count
+from jaxbeam.scene.scene import Scene, command, command_count
 
 
 class States:
     """States of one scene under `s` commands: a ramp, or a sweep.
 
     Args:
-        scene: with `n` nodes and `m` tendons.
-        commands: `(s, m)` ratios, dimensionless: `commands(ratios, steps)` for a ramp.
+        scene: with `n` nodes and `m` commands.
+        commands: `(s, m)`, such as ratios of tendons: `commands(ratios, steps)` for a ramp.
         x: `(s, n, 2)` node positions: `Solution.x` of that ramp or sweep.
         title: what to call them in pictures.
 
@@ -26,7 +26,7 @@ class States:
     """
 
     def __init__(self, scene: Scene, commands: Numbers, x: Numbers, title: str = "") -> None:
-        count = tendon_count(scene)
+        count = command_count(scene)
         self.scene, self.commands, self.x, self.title = scene, np.asarray(commands), np.asarray(x), title
         if self.commands.ndim != 2 or self.commands.shape[0] == 0 or self.commands.shape[1] != count:
             raise ValueError(f"commands: expected shape (s, {count}), a row for each state, got {self.commands.shape}")

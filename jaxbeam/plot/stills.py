@@ -68,7 +68,7 @@ def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | N
     pushing = np.asarray(_pushing(scene, jnp.asarray(positions)))
     _Beam(axes[0], scene).move(positions, pushing)
     if figure:
-        _legend(figure, [pushing])
+        _legend(figure, [scene], [pushing])
         _fit(figure, axes)
     return axes[0]
 
@@ -254,7 +254,7 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
     for ax, title, x, push in zip(axes, titles, states.x, pushing, strict=False):
         ax.set_title(title, fontsize="medium")
         _Beam(ax, states.scene).move(x, push)
-    _legend(figure, [pushing])
+    _legend(figure, [states.scene], [pushing])
     _fit(figure, axes[::columns])
     return figure
 

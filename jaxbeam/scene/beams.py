@@ -95,7 +95,7 @@ def rod_beam(
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
     dtype: Any = None,
 ) -> Scene:
-    """The reference scene as a rod (see `jaxbeam.rod`): a cantilever with a tendon along half of each side.
+    """The reference scene as a rod (see `jaxbeam.physics.rod`): a cantilever with a tendon along half of each side.
 
     Args:
         nodes: along the axis, odd, so that a middle one exists. Nine are within 0.5 % of the limit of many: at ratios

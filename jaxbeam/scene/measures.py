@@ -16,12 +16,8 @@ import numpy as np
 
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.mesh.elements import EDGES, degree_of, rule
-from jaxbeam.mesh.line import Line
 from jaxbeam.physics.energy import Term
-from jaxbeam.physics.rod import RodEnergy
-from jaxbeam.physics.solid import SolidEnergy, SolidParams, displacement_gradients
-from jaxbeam.physics.tendon import TendonEnergy
-from jaxbeam.scene.scene import Scene, placed, solid_terms, tendon_terms
+from jaxbeam.scene.scene import Scene, placed
 
 
 @usual_rules
@@ -67,7 +63,7 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     """
     x = placed(scene, x)
     tip = _tip(scene)
-    if isinstance(scene.mesh, Line):
+    if scene.mesh.radian is not None:
         return jnp.rad2deg(jnp.mean((x - scene.mesh.nodes)[tip, 2]) / scene.mesh.radian)
     if tip.shape[0] < 2:
         raise ValueError(f"scene: expected at least two tip nodes to measure a rotation, got {tip.shape[0]}")
@@ -80,13 +76,13 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
 @usual_rules
 def tendon_lengths(scene: Scene, x: jax.Array) -> jax.Array:
     """Present length of each tendon, `(m,)`."""
-    return _over_tendons(scene, x, lambda energy: energy.length)
+    return _measured(scene, x, "length")
 
 
 @usual_rules
 def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `dE/dl = k (l - l*)` of each tendon, `(m,)`; positive when it pulls its ends together."""
-    return _over_tendons(scene, x, lambda energy: energy.tension)
+    return _measured(scene, x, "tension")
 
 
 @usual_rules
@@ -126,8 +122,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
 def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
     x = placed(scene, x)
-    bodies = [t for t in scene.terms if isinstance(t.energy, SolidEnergy | RodEnergy)]
-    found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in bodies]
+    found = [jax.vmap(t.energy)(x[t.nodes], t.params) for t in scene.terms if t.kind.body]
     return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
 
 
@@ -144,15 +139,9 @@ def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> j
 
 def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
     """For each solid, `measure(H, density, material)` at the quadrature points of its elements, `(m, q, ...)`."""
-    x, found = placed(scene, x), []
-    for term in solid_terms(scene):
-        assert isinstance(term.energy, SolidEnergy)
-        density = term.energy.density
-
-        def one(positions: jax.Array, params: SolidParams, density: Callable = density) -> jax.Array:
-            return jax.vmap(lambda H: measure(H, density, params.material))(displacement_gradients(positions, params))
-
-        found.append((term, jax.vmap(one)(x[term.nodes], term.params)))
+    x = placed(scene, x)
+    asked = [(term, term.kind.at_points(x[term.nodes], term.params, measure)) for term in scene.terms]
+    found = [(term, values) for term, values in asked if values is not None]
     if not found:
         raise ValueError("scene: expected a solid term, got none; stress and J are measured on solids")
     return found
@@ -175,13 +164,11 @@ def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
     return np.concatenate([at_corners, between])[:nodes]
 
 
-def _over_tendons(scene: Scene, x: jax.Array, measure: Callable[[TendonEnergy], Callable[..., jax.Array]]) -> jax.Array:
-    """A measure of each tendon, `(m,)`."""
-    x, found = placed(scene, x), []
-    for term in tendon_terms(scene):
-        assert isinstance(term.energy, TendonEnergy)
-        found.append(jax.vmap(measure(term.energy))(x[term.nodes], term.params))
-    return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
+def _measured(scene: Scene, x: jax.Array, name: str) -> jax.Array:
+    """What the terms measure under this name, `(m,)`, in their order."""
+    x = placed(scene, x)
+    found = [term.kind.measured(x[term.nodes], term.params) for term in scene.terms]
+    return jnp.concatenate([*(each[name] for each in found if name in each), jnp.zeros(0, x.dtype)])
 
 
 def _tip(scene: Scene) -> np.ndarray:

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.physics.rod_tendon import Offsets, at_offsets
-from jaxbeam.scene.scene import Scene, rod_terms
+from jaxbeam.scene.scene import Scene
 
 # Segments of a curved edge.
 SEGMENTS = 4
@@ -23,7 +22,7 @@ SEGMENTS = 4
 def crossing(scene: Scene, x: jax.Array) -> jax.Array:
     """The first two edges of the surface that cross at `x` `(n, d)`, as node numbers `(2, 2)` of their ends; -1 if none
     do. Edges that share a node do not count: `J` says whether these fold over."""
-    segments = [_of_solids(scene, x), *_of_rods(scene, x)]
+    segments = [_of_solids(scene, x), *_of_sides(scene, x)]
     points, ids, edges = (jnp.concatenate(each) for each in zip(*segments, strict=True))
     if not len(points):
         return jnp.full((2, 2), -1, jnp.int32)
@@ -64,12 +63,10 @@ def _parabola(xi: np.ndarray) -> np.ndarray:
     return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=1)
 
 
-def _of_rods(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
-    """The same for both sides of each rod."""
+def _of_sides(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+    """The same for what terms without elements of area say that bounds them, such as both sides of a rod."""
     found = []
-    for term in rod_terms(scene):
+    for term in scene.terms:
         nodes = jnp.asarray(term.nodes)
-        for side in (0.5, -0.5):
-            offsets = Offsets(jnp.tile(side * term.params.height[:, None], 2), term.params.radian)
-            found.append((at_offsets(x[nodes], offsets), nodes, nodes))
+        found += [(segments, nodes, nodes) for segments in term.kind.sides(x[nodes], term.params)]
     return found

@@ -22,23 +22,13 @@ from jaxbeam.core.tree import (
     index_field,
     is_concrete,
     key_of,
-    namespace,
     pytree,
     read_only,
     replace,
-    to_device,
 )
-from jaxbeam.mesh.line import Line
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.surface import surface_of
 from jaxbeam.physics.energy import Term, check_nodes
-from jaxbeam.physics.load import dead_load_energy
-from jaxbeam.physics.materials import Lame
-from jaxbeam.physics.rod import RodEnergy, fibre_stretches
-from jaxbeam.physics.rod_tendon import at_offsets
-from jaxbeam.physics.solid import SolidEnergy, forbids_inversion
-from jaxbeam.physics.stencils import admissible_step, rest_is_sound, smallest_ratios, stencil_gradients, stencil_hessian
-from jaxbeam.physics.tendon import TendonEnergy
 
 
 @pytree
@@ -46,7 +36,7 @@ class Scene:
     """What is simulated.
 
     Args:
-        mesh: the body at rest, with `n` nodes of `d` coordinates: 2, or 3 on a `Line` (see `jaxbeam.rod`).
+        mesh: the body at rest, with `n` nodes of `d` coordinates: 2, or 3 on a `Line` (see `jaxbeam.mesh.line`).
         terms: the energies that are summed; one that is absent is never traced.
         fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`). It is
             eliminated from the unknowns.
@@ -85,17 +75,16 @@ class Scene:
         for number, term in enumerate(self.terms):
             check_nodes(f"terms[{number}].nodes", self.mesh, term.nodes, ndim=2)
             _check_dtype(number, term, self.mesh.nodes.dtype)
-            energy = term.energy
+            if term.kind.coordinates not in (None, shape[1]):
+                raise ValueError(
+                    f"terms[{number}]: it is made for nodes of {term.kind.coordinates} coordinates, got a mesh with "
+                    f"{shape[1]}; on triangles use solid and tendons, on the Line of a rod use rod and rod_tendons"
+                )
             _check_energy(number, term, self.mesh.nodes)
-            of_solids = isinstance(energy, SolidEnergy) or (
-                isinstance(energy, TendonEnergy) and energy.points is not at_offsets
-            )
-            if isinstance(self.mesh, Line) and of_solids:
-                raise ValueError(f"terms[{number}]: it is made for solids; on a Line use rod and rod_tendons")
         tip = check_nodes("tip", self.mesh, self.tip, ndim=1) if np.size(self.tip) else np.zeros(0)
         object.__setattr__(self, "fixed", read_only(fixed))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
-        bodies = tuple(key_of(term, "nodes") for term in self.terms if isinstance(term.energy, SolidEnergy))
+        bodies = tuple(key_of(term, "nodes") for term in self.terms if term.kind.fills)
         object.__setattr__(self, "surface", surface_of(bodies))
 
 
@@ -110,9 +99,7 @@ def _check_dtype(number: int, term: Term, dtype: Any) -> None:
 
 
 def _check_energy(number: int, term: Term, nodes: jax.Array) -> None:
-    """Refuse an energy of a user's own that returns no scalar."""
-    if isinstance(term.energy, SolidEnergy | RodEnergy | TendonEnergy):
-        return
+    """Refuse an energy that returns no scalar."""
     leaves, structure = jax.tree.flatten(term.params)
     shapes = [((term.nodes.shape[1], nodes.shape[1]), nodes.dtype), *((leaf.shape[1:], leaf.dtype) for leaf in leaves)]
     _traced_once(f"terms[{number}].energy", term.energy, structure, tuple(shapes))
@@ -149,51 +136,60 @@ def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
     return fixed
 
 
+# ------------------------------------------------------------------------------------------- commands
+
+
 @usual_rules
-def command(scene: Scene, ratios: Numbers) -> Scene:
-    """The scene with new commanded lengths, `ratio * natural length`.
+def command(scene: Scene, commands: Numbers) -> Scene:
+    """The scene under new commands, one for each stencil that is commanded.
 
     Args:
-        scene: with `m` tendons.
-        ratios: `(m,)`, positive, in the order of the tendons; differentiable.
+        scene: with `m` commands in all, in the order of its terms.
+        commands: `(m,)`; differentiable. That of a tendon is the ratio of its commanded to its natural length.
 
     Raises:
-        ValueError: if the count is wrong or a concrete ratio is not positive and finite.
+        ValueError: if the count is wrong or a concrete command is out of its range, as a ratio that is not positive.
     """
     check_scene(scene)
-    ratios = checks.shaped("ratios", ratios, ((tendon_count(scene),),), "one for each tendon")
-    # `is_valid` looks at traced ones: the commanded length is a parameter.
-    if is_concrete(ratios):
-        checks.inside("ratios", ratios, checks.POSITIVE, why="1 is the natural length and 0.5 half of it")
+    values = checks.shaped("ratios", commands, ((command_count(scene),),), "one for each tendon")
     terms, start = [], 0
     for term in scene.terms:
-        if isinstance(term.energy, TendonEnergy):
-            stop, natural = start + term.nodes.shape[0], term.params.natural
-            xp = namespace(ratios, natural)
-            commanded = xp.asarray(ratios, natural.dtype)[start:stop] * xp.asarray(natural)
-            params = replace(term.params, commanded=to_device(commanded))
-            term, start = replace(term, params=params), stop
+        if term.kind.rest_command is not None:
+            stop = start + term.nodes.shape[0]
+            # `is_valid` looks at traced ones: commands are parameters.
+            if is_concrete(values):
+                checks.inside("ratios", values[start:stop], term.kind.commands, why=term.kind.command_hint)
+            term, start = replace(term, params=term.kind.command(term.params, values[start:stop])), stop
         terms.append(term)
     return replace(scene, terms=tuple(terms))
 
 
-def partway(scene: Scene, fraction: jax.Array) -> Scene:
-    """The scene with only a fraction of its actuation: of every tendon's shortening and every dead load."""
-    terms = []
-    for term in scene.terms:
-        params = term.params
-        if isinstance(term.energy, TendonEnergy):
-            params = replace(params, commanded=(1 - fraction) * params.natural + fraction * params.commanded)
-        elif term.energy is dead_load_energy:
-            params = replace(params, value=fraction * params.value)
-        terms.append(replace(term, params=params))
-    return replace(scene, terms=tuple(terms))
+def commanded_terms(scene: Scene) -> list[Term]:
+    """The terms that are commanded, in order; their stencils are numbered through."""
+    return [term for term in scene.terms if term.kind.rest_command is not None]
 
 
-def ratios_of(scene: Scene) -> jax.Array:
-    """The ratio `(m,)` that each tendon is commanded to now."""
-    found = [term.params.commanded / term.params.natural for term in tendon_terms(scene)]
+def command_count(scene: Scene) -> int:
+    """How many commands there are to give."""
+    return sum(term.nodes.shape[0] for term in commanded_terms(scene))
+
+
+def commands_of(scene: Scene) -> jax.Array:
+    """The commands `(m,)` that the scene is under now."""
+    found = [term.kind.command_of(term.params) for term in commanded_terms(scene)]
     return jnp.concatenate([*found, jnp.zeros(0, scene.mesh.nodes.dtype)])
+
+
+def rest_commands(scene: Scene) -> np.ndarray:
+    """The commands `(m,)` under which nothing acts: 1 for a tendon."""
+    found = [np.full(len(term.nodes), term.kind.rest_command) for term in commanded_terms(scene)]
+    return np.concatenate([*found, np.zeros(0)]).astype(scene.mesh.nodes.dtype)
+
+
+def partway(scene: Scene, share: jax.Array) -> Scene:
+    """The scene with only a share of its actuation and its loads."""
+    terms = [replace(term, params=term.kind.partway(term.params, share)) for term in scene.terms]
+    return replace(scene, terms=tuple(terms))
 
 
 def is_valid(scene: Scene) -> jax.Array:
@@ -202,37 +198,8 @@ def is_valid(scene: Scene) -> jax.Array:
     for term in scene.terms:
         for leaf in jax.tree.leaves(term.params):
             valid &= jnp.all(jnp.isfinite(leaf)) if jnp.issubdtype(leaf.dtype, jnp.inexact) else True
-        if isinstance(term.energy, TendonEnergy):
-            valid &= jnp.all((term.params.commanded > 0) & (term.params.modulus > 0))
-        if isinstance(term.energy, RodEnergy):
-            valid &= jnp.all((term.params.height > 0) & (term.params.radian > 0))
-        if isinstance(term.energy, SolidEnergy):
-            valid &= jnp.all(rest_is_sound(term.params))
-        bodily = isinstance(term.energy, SolidEnergy | RodEnergy)
-        if bodily and isinstance(material := term.params.material, Lame):
-            # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
-            valid &= jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
+        valid &= term.kind.valid(term.params)
     return valid
-
-
-def tendon_terms(scene: Scene) -> list[Term]:
-    """The terms that are tendons, in order; their tendons are numbered through."""
-    return [term for term in scene.terms if isinstance(term.energy, TendonEnergy)]
-
-
-def tendon_count(scene: Scene) -> int:
-    """How many tendons there are to command."""
-    return sum(term.nodes.shape[0] for term in tendon_terms(scene))
-
-
-def solid_terms(scene: Scene) -> list[Term]:
-    """The terms that are solids, in order."""
-    return [term for term in scene.terms if isinstance(term.energy, SolidEnergy)]
-
-
-def rod_terms(scene: Scene) -> list[Term]:
-    """The terms that are rods, in order."""
-    return [term for term in scene.terms if isinstance(term.energy, RodEnergy)]
 
 
 # ------------------------------------------------------------------------- energy, forces, Hessians
@@ -260,7 +227,7 @@ def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
     energy = energy_scale = jnp.zeros((), x.dtype)
     both = jnp.zeros((*x.shape, 2), x.dtype)
     for term in scene.terms:
-        energies, gradients = stencil_gradients(term, x)
+        energies, gradients = term.kind.gradients(x[term.nodes], term.params)
         energy += jnp.sum(energies)
         energy_scale += jnp.sum(jnp.abs(energies))
         both = both.at[term.nodes].add(jnp.stack([gradients, jnp.abs(gradients)], axis=-1))
@@ -292,7 +259,7 @@ def reactions(scene: Scene, x: jax.Array) -> jax.Array:
 
 def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[jax.Array]:
     """For each term, the `(k d, k d, m)` Hessians of its stencils, by autodiff; or positive semidefinite ones."""
-    return [stencil_hessian(term, x, convex) for term in scene.terms]
+    return [term.kind.hessians(x[term.nodes], term.params, convex) for term in scene.terms]
 
 
 @usual_rules
@@ -305,31 +272,23 @@ def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The smallest `J` `()` anywhere in the solids, or stretch of a fibre of the rods, and the number `()` of its
     element (-1 in a scene without either)."""
-    ratios = [smallest_ratios(x[t.nodes], t.params) for t in solid_terms(scene)]
-    ratios += [jnp.min(jax.vmap(fibre_stretches)(x[t.nodes], t.params), axis=1) for t in rod_terms(scene)]
-    if not ratios:
+    found = [term.kind.margin(x[term.nodes], term.params) for term in scene.terms]
+    margins = [each for each in found if each is not None]
+    if not margins:
         return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
-    every = jnp.concatenate(ratios)
+    every = jnp.concatenate(margins)
     element = jnp.argmin(every)
     return every[element], element.astype(jnp.int32)
-
-
-# An element under this `J` is let through zero, where its energy allows that: held back, it would be approached
-# in ever smaller steps. It may well come back, and if it does not, the solution says so. Away from the quadrature
-# points every energy allows it.
-RELEASED = 0.1
 
 
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
     """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
 
-    The quadrature points of a density that forbids inversion always do; all else only while it is not under
-    `RELEASED`.
+    What an energy lets through zero it says itself (see `Energy.longest_step`).
     """
     limits = [jnp.asarray(jnp.inf, x.dtype)]
-    for term in solid_terms(scene):
-        assert isinstance(term.energy, SolidEnergy)
-        bound = 0.0 if forbids_inversion(term.energy, term.params) else RELEASED
-        steps = admissible_step(x[term.nodes], dx[term.nodes], term.params, keep, bound, RELEASED)
-        limits.append(jnp.min(steps))
+    for term in scene.terms:
+        steps = term.kind.longest_step(x[term.nodes], dx[term.nodes], term.params, keep)
+        if steps is not None:
+            limits.append(jnp.min(steps))
     return jnp.min(jnp.stack(limits))

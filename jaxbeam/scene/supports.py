@@ -20,12 +20,8 @@ import jax
 import numpy as np
 
 from jaxbeam.core.tree import Key, is_concrete, key_of, replace, unlock
-from jaxbeam.mesh.line import Line
 from jaxbeam.mesh.mesh import pieces
 from jaxbeam.physics.energy import Term
-from jaxbeam.physics.rod import RodEnergy
-from jaxbeam.physics.solid import SolidEnergy
-from jaxbeam.physics.stencils import stencil_gradients, stencil_hessian
 from jaxbeam.scene.scene import Scene
 
 # Round-off of a stencil's second variation, in eps of its dtype times the magnitudes that were added up in it. Measured
@@ -77,7 +73,7 @@ def check_held(scene: Scene) -> None:
     rigid = _rigid_motions(scene)
     _, values, basis = np.linalg.svd(rigid.slope[scene.fixed], full_matrices=True)
     free = basis[np.sum(values > 1e-9) :].T
-    others = tuple(term for term in scene.terms if not isinstance(term.energy, SolidEnergy | RodEnergy))
+    others = tuple(term for term in scene.terms if not term.kind.body)
     if free.shape[1] and others:
         free = _unresisted(replace(scene, terms=others), rigid, free)
     if not free.shape[1]:
@@ -114,7 +110,7 @@ def _rigid_motions(scene: Scene) -> Rigid:
     node = np.arange(len(whole))
     slope[node, 0, piece, 0] = slope[node, 1, piece, 1] = 1
     slope[node, :2, piece, 2] = arms[:, ::-1] * [-1, 1] / size[:, None]
-    if isinstance(scene.mesh, Line):
+    if scene.mesh.radian is not None:
         # The third coordinate is an angle: it turns at a constant rate.
         slope[node, 2, piece, 2] = float(scene.mesh.radian) / size
     bend[:, :2] = -arms / size[:, None] ** 2
@@ -145,7 +141,7 @@ def _unresisted(scene: Scene, rigid: Rigid, free: np.ndarray) -> np.ndarray:
 @jax.jit
 def _derivatives(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
     """For each term, gradients `(m, k, d)` and Hessians `(k d, k d, m)` of its stencils."""
-    return [(stencil_gradients(term, x)[1], stencil_hessian(term, x)) for term in scene.terms]
+    return [(t.kind.gradients(x[t.nodes], t.params)[1], t.kind.hessians(x[t.nodes], t.params)) for t in scene.terms]
 
 
 def _resistance(term: Term, gradients: np.ndarray, hessians: np.ndarray, rigid: Rigid, eps: float) -> Resistance:

@@ -16,7 +16,7 @@ from jax import lax
 from jaxbeam.core.compiling import choose
 from jaxbeam.linear.layout import Layout
 from jaxbeam.scene.overlap import crossing
-from jaxbeam.scene.scene import Scene, energy, extent, is_valid, ratios_of, worst_element
+from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, worst_element
 from jaxbeam.solve.newton import HALVINGS, INACCURATE, PROJECTED, STEPS, Newton, State, newton, no_factor
 from jaxbeam.solve.predictor import Trail, ahead, extend
 from jaxbeam.solve.solution import Solution, Status
@@ -194,7 +194,7 @@ def follow(
     # Where the walk ended before the last target, the targets after it are given up in the same state.
     row = jnp.minimum(jnp.arange(last + 1, dtype=jnp.int32), walk.leg)
     path = jax.tree.map(lambda all: all[row], walk.path)
-    ratios = jax.vmap(lambda s: ratios_of(scene_at(s)))(targets)
+    ratios = jax.vmap(lambda s: commands_of(scene_at(s)))(targets)
     crossed = lax.map(lambda x: crossing(scene_at(targets[0]), x), path.x)
     return _solutions(path, ratios, crossed, solver), walk.factor, walk.trail
 

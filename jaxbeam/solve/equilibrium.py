@@ -24,11 +24,11 @@ from jaxbeam.scene.scene import (
     Scene,
     check_scene,
     command,
+    commands_of,
     energy,
     evaluate,
     partway,
     placed,
-    ratios_of,
     smallest_jacobian,
     stencil_hessians,
     worst_element,
@@ -134,7 +134,7 @@ def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any
     """The solution as a function of the scene: `x`, `energy`, `smallest_jacobian` and `ratios` move with it."""
     x = follow_scene(solver.linear, scene, layout, solution.x, factor, solution.status == 0)
     return replace(
-        solution, x=x, energy=energy(scene, x), smallest_jacobian=smallest_jacobian(scene, x), ratios=ratios_of(scene)
+        solution, x=x, energy=energy(scene, x), smallest_jacobian=smallest_jacobian(scene, x), ratios=commands_of(scene)
     )
 
 

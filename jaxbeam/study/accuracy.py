@@ -24,15 +24,12 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
-from jaxbeam.core.tree import is_concrete, replace, unlock
+from jaxbeam.core.tree import is_concrete, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
-from jaxbeam.mesh.elements import degree_of
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer, cut_in_four, with_middle_nodes
 from jaxbeam.mesh.surface import surface
-from jaxbeam.physics.energy import Term
-from jaxbeam.physics.solid import SolidEnergy, solid
-from jaxbeam.physics.tendon import TendonEnergy, tendons
+from jaxbeam.physics.energy import NotRefinable, Term
 from jaxbeam.scene.scene import Scene, check_scene, evaluate, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_asked, topology
@@ -73,8 +70,8 @@ class ErrorEstimate(NamedTuple):
 
     value: the measure of the solution. discretisation: estimate of what the mesh leaves, signed: value + discretisation
     is a better value. algebraic: estimate of what the solver leaves. bar: bound of the error of the value; infinite if
-    there is nothing to be said: the solution is not `OK`, or the answer has no limit as the mesh is refined. reason:
-    why that is, or empty.
+    there is nothing to be said: the solution is not `OK`, the answer has no limit as the mesh is refined, or a term
+    does not say what it is on a finer mesh. reason: why that is, or empty.
     """
 
     value: float
@@ -162,6 +159,7 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     numbers, so that terms that act on nodes stay as they are.
 
     Raises:
+        NotRefinable: a `ValueError` that names a term which cannot be refined.
         ValueError: if the scene is traced or its mesh has no triangles.
     """
     check_scene(scene)
@@ -181,30 +179,29 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     may = outside | ~new
     fixed = np.stack([inherit(column) & may for column in scene.fixed.T], axis=1)
     tip = np.append(scene.tip, np.flatnonzero(inherit(np.isin(np.arange(count), scene.tip)) & outside & new))
-    terms = tuple(_on(mesh, term, len(finer.elements) // len(elements)) for term in scene.terms)
+    terms = tuple(_refined(k, term, mesh, len(finer.elements) // len(elements)) for k, term in enumerate(scene.terms))
     return Scene(mesh, terms, fixed, tip), finer
 
 
-def _on(mesh: Mesh, term: Term, parts: int) -> Term:
+def _refined(number: int, term: Term, mesh: Mesh, parts: int) -> Term:
     """A term on the finer mesh, where each element has become `parts`."""
-    if isinstance(term.energy, SolidEnergy):
-        material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), parts, axis=0), term.params.material)
-        return solid(mesh, material, term.energy.density, max(degree_of(term.params.weights.shape[1]), 2))
-    if isinstance(term.energy, TendonEnergy) and term.params.width is not None:
-        params = term.params
-        same = tendons(mesh, params.ends, params.modulus, term.energy.stiffness, np.asarray(params.width))
-        return replace(same, params=replace(same.params, natural=params.natural, commanded=params.commanded))
-    return term
+    try:
+        return term.kind.refined(term, mesh, parts)
+    except NotRefinable as error:
+        raise NotRefinable(f"terms[{number}] ({term.kind.name}) has no form on a finer mesh: {error}") from None
 
 
 def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton) -> tuple[ErrorEstimate, Scene, Any]:
     """The estimate, the finer scene, and where its own solution is expected."""
-    finer, way = enriched(scene)
-    start = way.carry(np.asarray(solution.x))
     if (shape := jax.eval_shape(measure, scene, solution.x).shape) != ():
         raise ValueError(f"measure: expected a function that returns a scalar, got shape {shape}")
     own = _change(scene, solution.x, measure, solver)
     value, algebraic = own.value, own.total
+    try:
+        finer, way = enriched(scene)
+    except NotRefinable as error:
+        return ErrorEstimate(value, np.nan, algebraic, np.inf, str(error)), scene, solution.x
+    start = way.carry(np.asarray(solution.x))
     step = _change(finer, start, measure, solver, way)
     change, cancelled = step.total, min(step.parts[step.parts > 0].sum(), -step.parts[step.parts < 0].sum())
     near = SMALL * np.ptp(np.asarray(scene.mesh.nodes), axis=0).max()
@@ -232,8 +229,8 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
         return "the solution is not OK"
     free = np.logical_not(scene.fixed.all(axis=1))
     for term in scene.terms:
-        if isinstance(term.energy, TendonEnergy) and term.params.width is None and free[term.nodes].any():
-            return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+        if reason := term.kind.without_limit(term, free):
+            return reason
     return "" if np.isfinite(change) else "the finer mesh has no stable equilibrium near"
 
 

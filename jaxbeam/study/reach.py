@@ -14,7 +14,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import blank, choose, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, replace
 from jaxbeam.scene.measures import tip_angle
-from jaxbeam.scene.scene import Scene, tendon_count
+from jaxbeam.scene.scene import Scene, command_count
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_asked, topology
 from jaxbeam.study.design import Design, DesignStatus
@@ -124,7 +124,7 @@ def _problem(
     checks.count("max_solves", max_solves, 1)
     check_held(scene)
     dtype = scene.mesh.nodes.dtype
-    count = tendon_count(scene)
+    count = command_count(scene)
     if not count:
         raise ValueError("scene: expected at least one tendon to command, got none")
     if tolerance is None:

@@ -7,7 +7,7 @@ import pytest
 from helpers import EPS, central_difference
 
 import jaxbeam as jb
-from jaxbeam.physics.stencils import admissible_step, smallest_ratios, volume_ratios
+from jaxbeam.physics.volume import admissible_step, smallest_ratios, volume_ratios
 from jaxbeam.scene.scene import is_valid
 
 smallest = jax.jit(smallest_ratios)

@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxbeam as jb
 from jaxbeam.physics.solid import displacement_gradients
-from jaxbeam.physics.stencils import admissible_step, volume_ratios
+from jaxbeam.physics.volume import admissible_step, volume_ratios
 
 MESHES = {
     "rectangle": disturbed(jb.rectangle(2.0, 1.0, 5, 4)),

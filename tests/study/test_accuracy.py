@@ -10,7 +10,7 @@ import jaxbeam as jb
 from jaxbeam.core.tree import replace
 from jaxbeam.mesh.elements import DEGREES, rule, shape_functions, shape_slopes
 from jaxbeam.mesh.surface import patch, surface
-from jaxbeam.physics.stencils import volume_ratios
+from jaxbeam.physics.volume import volume_ratios
 
 MESHES = {
     "rectangle": lambda: jb.rectangle(3.0, 1.0, 4, 3),
