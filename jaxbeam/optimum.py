@@ -90,7 +90,8 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     problem_dot, target_dot, _ = tangents
     m, p = answer.theta.size, target.size
     theta, price = follow_optimum(measure, linear, *primals)
-    # The slope of a bad answer is NaN: kept out of second derivatives that do not look at it.
+    # What is bad stays out of the derivatives of a loss that does not look at it.
+    goal = jnp.where(answer.trusted, target, 0)
     theta = jnp.where(answer.trusted, theta, answer.theta)
     price = jnp.where(answer.trusted, price, 0)
     at = jnp.concatenate([theta, price])
@@ -108,7 +109,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
 
     def product(v: jax.Array) -> jax.Array:
         """The Hessian of the Lagrangian over what is free; the unit matrix over what a bound holds."""
-        moved = jax.jvp(partial(slope, problem, target), (at,), (jnp.where(held, 0, v),))[1]
+        moved = jax.jvp(partial(slope, problem, goal), (at,), (jnp.where(held, 0, v),))[1]
         return jnp.where(held, v, moved)
 
     hessian = lax.stop_gradient(jax.vmap(product)(jnp.eye(m + p, dtype=at.dtype)))
@@ -126,7 +127,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
         y = scale * (vectors @ ((vectors.T @ (scale * b)) / values))
         return jnp.where(answer.trusted & sound, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(b.dtype))
 
-    pull = jax.jvp(slope, (problem, target, at), (problem_dot, target_dot, carried))[1]
+    pull = jax.jvp(slope, (problem, goal, at), (problem_dot, target_dot, carried))[1]
     moved = lax.custom_linear_solve(product, -jnp.where(held, 0, pull), solve, symmetric=True) + carried
     return (theta, price), (moved[:m], moved[m:])
 
