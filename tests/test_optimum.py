@@ -125,7 +125,8 @@ def test_a_peak_between_bounds():
     design = free(PLAIN)
     assert int(design.status) == UNREACHABLE and not np.asarray(design.held).any()
     slope = jax.jacrev(lambda v: free(v).theta)(PLAIN)
-    np.testing.assert_allclose(slope[:, 0], 0, atol=1e-10)
+    # The slope of the measure is as small as the search left it.
+    np.testing.assert_allclose(slope[:, 0], 0, atol=1e-8)
     # The search rests where a step is below 1e-6.
     truth = differences(lambda v: free(jnp.asarray(v)).theta, np.asarray(PLAIN))
     np.testing.assert_allclose(slope, truth, rtol=0, atol=1e-6 * np.abs(truth).max())
