@@ -38,6 +38,7 @@ class Answer(NamedTuple):
 
     theta: `(m,)` commands. x: `(n, 2)` their equilibrium. held: `(m,)` the bounds that hold, as in `Design`.
     reached: `()` whether the target is met. trusted: `()` whether the search converged, to an equilibrium.
+    factor: of the stiffness there, made by `move_answer`; finite where the answer is not trusted.
     """
 
     theta: jax.Array
