@@ -109,7 +109,8 @@ def _mapped(function: Callable[..., T], axes: Axes) -> Callable[..., T]:
     return function
 
 
-def _still(leaf: jax.Array) -> Any:
-    """The tangent of what does not move."""
+def _still(leaf: Any) -> Any:
+    """The tangent of what does not move. A constant inside a traced function may come as a Python number."""
+    leaf = jnp.asarray(leaf)
     floating = jnp.issubdtype(leaf.dtype, jnp.inexact)
     return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)

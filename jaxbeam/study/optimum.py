@@ -38,6 +38,7 @@ class Answer(NamedTuple):
 
     theta: `(m,)` commands. x: `(n, 2)` their equilibrium. held: `(m,)` the bounds that hold, as in `Design`.
     reached: `()` whether the target is met. trusted: `()` whether the search converged, to an equilibrium.
+    factor: of the stiffness there, made by `move_answer`; finite where the answer is not trusted.
     """
 
     theta: jax.Array
@@ -57,10 +58,13 @@ def move_answer(
     still = lax.stop_gradient(unlock(command(problem.scene, answer.theta)))
     # XLA drops it where nothing is differentiated.
     storage = assemble(problem.layout, stencil_hessians(still, answer.x))
-    answer = answer._replace(held=held, factor=solver.linear.factor(problem.layout, storage)[0])
+    factor, _ = solver.linear.factor(problem.layout, storage)
+    # Any finite one in place of a bad one: zero times NaN would reach a loss that does not look at the answer.
+    sane = jax.tree.map(lambda leaf: jnp.where(answer.trusted, leaf, 1), factor)
+    answer = answer._replace(held=held, factor=sane)
     theta, _ = follow_optimum(measure, solver.linear, problem, jnp.ravel(target), answer)
     scene = command(problem.scene, theta)
-    moved = differentiable(unlock(scene), problem.layout, solution, answer.factor, solver)
+    moved = differentiable(unlock(scene), problem.layout, solution, factor, solver)
     return theta, moved, measure(scene, moved.x)
 
 
@@ -80,7 +84,7 @@ def follow_optimum(
 def _outcome(measure: Measure, linear: LinearSolver, problem: Problem, theta: jax.Array, answer: Answer) -> jax.Array:
     """The measure `(p,)` at commands `theta`."""
     scene = command(problem.scene, theta)
-    x = follow_scene(linear, unlock(scene), problem.layout, answer.x, answer.factor, answer.trusted)
+    x = follow_scene(linear, unlock(scene), problem.layout, answer.x, answer.factor, jnp.asarray(True))
     return jnp.ravel(measure(scene, x))
 
 
@@ -90,7 +94,8 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     problem_dot, target_dot, _ = tangents
     m, p = answer.theta.size, target.size
     theta, price = follow_optimum(measure, linear, *primals)
-    # The slope of a bad answer is NaN: kept out of second derivatives that do not look at it.
+    # What is bad stays out of the derivatives of a loss that does not look at it.
+    goal = jnp.where(answer.trusted, target, 0)
     theta = jnp.where(answer.trusted, theta, answer.theta)
     price = jnp.where(answer.trusted, price, 0)
     at = jnp.concatenate([theta, price])
@@ -108,7 +113,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
 
     def product(v: jax.Array) -> jax.Array:
         """The Hessian of the Lagrangian over what is free; the unit matrix over what a bound holds."""
-        moved = jax.jvp(partial(slope, problem, target), (at,), (jnp.where(held, 0, v),))[1]
+        moved = jax.jvp(partial(slope, problem, goal), (at,), (jnp.where(held, 0, v),))[1]
         return jnp.where(held, v, moved)
 
     hessian = lax.stop_gradient(jax.vmap(product)(jnp.eye(m + p, dtype=at.dtype)))
@@ -126,7 +131,9 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
         y = scale * (vectors @ ((vectors.T @ (scale * b)) / values))
         return jnp.where(answer.trusted & sound, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(b.dtype))
 
-    pull = jax.jvp(slope, (problem, target, at), (problem_dot, target_dot, carried))[1]
+    pull = jax.jvp(slope, (problem, goal, at), (problem_dot, target_dot, carried))[1]
+    # Commands without an effect do not ask what the target is: where the search failed their slope is NaN all the same.
+    pull = pull.at[m:].add(jnp.where(answer.trusted, 0, target_dot))
     moved = lax.custom_linear_solve(product, -jnp.where(held, 0, pull), solve, symmetric=True) + carried
     return (theta, price), (moved[:m], moved[m:])
 

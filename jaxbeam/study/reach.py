@@ -217,9 +217,9 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
         trusted=(found.status != DesignStatus.NOT_CONVERGED) & (found.solution.status == 0),
     )
     theta, solution, value = move_answer(measure, solver, problem, target, answer, found.solution)
-    # The slope of the distance exists nowhere at zero, where it stays.
-    miss, away = jnp.ravel(value - target), found.loss != 0
-    loss = jnp.where(away, jnp.linalg.norm(jnp.where(away, miss, 1)), 0 * jnp.sum(miss))
+    # At zero, where it stays, the distance has no slope; nor has that of a number that is none.
+    miss, far = jnp.ravel(value - target), jnp.isfinite(found.loss) & (found.loss != 0)
+    loss = jnp.where(far, jnp.linalg.norm(jnp.where(far, miss, 1)), jnp.sum(miss))
     return replace(found, theta=theta, solution=solution, value=value, loss=loss)
 
 

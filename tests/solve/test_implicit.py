@@ -616,17 +616,27 @@ def response(v):
     return jb.tip_angle(scene, jb.linear_response(scene))
 
 
+LINEAR = jnp.array([0.8, 1.0, 1.0, 1.0, 0.5])
+
+
 def test_slopes_of_the_linear_response():
-    """To second order, plainly and inside `lax.map`; the value is that outside of any transformation."""
-    v = jnp.array([0.8, 1.0, 1.0, 1.0, 0.5])
-    mapped = lambda v: jax.lax.map(response, jnp.stack([v, 1.1 * v]))[0]
+    """To second order; the value is that outside of any transformation."""
+    v = LINEAR
     first, second = jit(jax.grad(response)), jit(jax.hessian(response))(v)
     truth = differences_along(response, v)
     np.testing.assert_allclose(jax.jvp(response, (v,), (jnp.ones(5),))[0], response(v), rtol=1e-12)
     np.testing.assert_allclose(first(v), truth, rtol=0, atol=FIRST * np.abs(truth).max())
     truth = differences_along(first, v)
     np.testing.assert_allclose(second, truth, rtol=0, atol=SECOND * np.abs(truth).max())
-    np.testing.assert_allclose(jit(jax.jacrev(jax.jacrev(mapped)))(v), second, rtol=0, atol=1e-9 * np.abs(truth).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [jax.lax.map, lambda f, rows: jax.vmap(f)(rows)], ids=["map", "vmap"])
+def test_second_derivatives_of_mapped_linear_responses(mapped):
+    second = jit(jax.hessian(response))(LINEAR)
+    lanes = lambda v: mapped(response, jnp.stack([v, 1.1 * v]))[0]
+    for twice in (jax.jacrev(jax.jacrev(lanes)), jax.jacfwd(jax.jacfwd(lanes))):
+        np.testing.assert_allclose(jit(twice)(LINEAR), second, rtol=0, atol=1e-9 * np.abs(second).max())
 
 
 def differences_along(f, v):
