@@ -35,7 +35,7 @@ from scipy.spatial import cKDTree
 
 import jaxbeam as jb
 from benchmarks.report import table, version
-from jaxbeam.mesh.elements import rule, shape_functions
+from jaxbeam.mesh.elements import element_of, rule
 
 # --------------------------------------------------------------------------------- what several items need
 
@@ -513,7 +513,7 @@ def manufactured_errors(cells: int, order: int, solver: jb.Newton = jb.Newton())
     nodes, elements = np.asarray(mesh.nodes), mesh.elements
     fine = jb.solid(mesh, MMS_MATERIAL, degree=FINE).params
     weights, gradients = np.asarray(fine.weights), np.asarray(fine.gradients)
-    values = shape_functions(elements.shape[1], rule(FINE)[0])
+    values = element_of(elements).shape(rule(FINE)[0])
     at_points = lambda field: np.einsum("qk,tkd->tqd", values, field[elements])
     u, slope, force = (np.asarray(field) for field in exact_fields(jnp.asarray(at_points(nodes))))
     loads = np.zeros_like(nodes)

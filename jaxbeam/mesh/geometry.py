@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxbeam.mesh.bernstein import minimiser, value
-from jaxbeam.mesh.elements import EDGES, corner_slopes, determinants, is_affine
+from jaxbeam.mesh.elements import EDGES, corner_slopes, determinants, element_of
 
 # A triangle of no more area than this share of the square of the body's extent has none.
 SLIVER = 1e-14
@@ -56,7 +56,7 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
             f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
             f" ({bad.size} such triangles)"
         )
-    if not is_affine(elements.shape[1]):
+    if not element_of(elements).affine:
         _check_curves(nodes, elements, area)
 
 
@@ -129,9 +129,9 @@ def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) 
     # Measured from one of its nodes, wherever the body lies.
     begin, end = (nodes[edges[:, k]] - nodes[edges[0, 0]] for k in (0, 1))
     extent = np.ptp(begin, axis=0)
-    if elements.shape[1] == 6:
-        bulge = nodes[elements[:, 3:]] - nodes[elements[:, EDGES]].mean(axis=2)
-        if np.abs(bulge).max() > 1e-9 * extent.max():
+    for edge in element_of(elements).edges:
+        bulge = nodes[elements[:, edge[2:]]] - nodes[elements[:, edge[:2]]].mean(axis=1, keepdims=True)
+        if np.abs(bulge).max(initial=0) > 1e-9 * extent.max():
             return
     first, second = _crossing(begin, end, int(np.argmax(extent)))
     if first.size:

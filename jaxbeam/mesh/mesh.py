@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, pytree, to_device
-from jaxbeam.mesh.elements import EDGES
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.geometry import SLIVER, _areas, _check_geometry, _check_overlaps, _check_topology, _surface_of
 
 
@@ -61,13 +61,10 @@ class Mesh:
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
     """Corner nodes, in the order given, and the nodes that lie between two of them."""
-    among = np.isin(mesh.elements[:, :3], corners)
-    found = (
-        [mesh.elements[among[:, a] & among[:, b], 3 + k] for k, (a, b) in enumerate(EDGES)]
-        if mesh.elements.shape[1] == 6
-        else []
-    )
-    return np.concatenate([corners, np.unique(np.concatenate([*found, np.zeros(0, int)]))]).astype(int)
+    among, found = np.isin(mesh.elements, corners), [np.zeros(0, int)]
+    for first, second, *between in element_of(mesh.elements).edges:
+        found.append(mesh.elements[among[:, first] & among[:, second]][:, between].ravel())
+    return np.concatenate([corners, np.unique(np.concatenate(found))]).astype(int)
 
 
 def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
@@ -133,7 +130,7 @@ def _concrete_nodes(mesh: Mesh) -> np.ndarray:
 def check_triangles(mesh: Mesh) -> None:
     """Refuse what is not a mesh of triangles."""
     checks.instance("mesh", mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)")
-    if mesh.elements.shape[1] == 2:
+    if mesh.radian is not None:
         raise ValueError("mesh: expected triangles, got the Line of a rod, whose body is rod(line, height, params)")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import namespace
-from jaxbeam.mesh.elements import EDGES, shape_functions
+from jaxbeam.mesh.elements import FOUR_PARTS, QUADRATIC_TRIANGLE, TRIANGLE, Element, element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 
 
@@ -22,7 +22,7 @@ def quadratic(mesh: Mesh) -> Mesh:
         ValueError: if the triangles have six nodes already, or it is not made of triangles.
     """
     check_triangles(mesh)
-    if mesh.elements.shape[1] != 3:
+    if element_of(mesh.elements) is not TRIANGLE:
         raise ValueError("mesh: its triangles have six nodes already")
     return _made(mesh, with_middle_nodes(mesh.elements, len(mesh.nodes)))
 
@@ -56,39 +56,42 @@ class Finer(NamedTuple):
 
 def with_middle_nodes(elements: np.ndarray, count: int) -> Finer:
     """Triangles of three nodes as triangles of six."""
-    pairs = np.sort(elements[:, EDGES].reshape(-1, 2), axis=1)
-    ends, number = np.unique(pairs, axis=0, return_inverse=True)
-    old = np.repeat(np.arange(count)[:, None], 2, axis=1)
-    weights = np.concatenate([np.tile([1.0, 0.0], (count, 1)), np.full((len(ends), 2), 0.5)])
-    whole = np.concatenate([elements, count + number.reshape(-1, 3)], axis=1)
-    return Finer(whole, np.concatenate([old, ends]), weights)
+    return _divided(elements, count, QUADRATIC_TRIANGLE, np.eye(3)[None])
 
 
 def cut_in_four(elements: np.ndarray, count: int) -> Finer:
-    """Each triangle as four of the same number of nodes, at the corners and in the middle."""
-    if elements.shape[1] == 3:
-        six = with_middle_nodes(elements, count)
-        four = six.elements[:, _PARTS[:, :3]]
-        return Finer(four.reshape(-1, 3), six.nodes, six.weights)
-    inside = np.stack([(_PLACES[part[a]] + _PLACES[part[b]]) / 2 for part in _PARTS for a, b in EDGES])
-    # Parts share nodes with each other and triangles with their neighbours: one is known by its corners, weighted.
-    quarters = np.round(4 * inside).astype(np.int64)
-    corners = elements[:, None, :3].astype(np.int64)
-    keys = np.sort(np.where(quarters > 0, corners * 4 + quarters, -1), axis=2).reshape(-1, 3)
-    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    whole = np.concatenate([elements[:, _PARTS], (count + number).reshape(-1, 4, 3)], axis=2)
-    values = shape_functions(6, inside)
-    old = np.repeat(np.arange(count)[:, None], 6, axis=1)
-    own = np.tile(np.eye(1, 6), (count, 1))
-    nodes = np.concatenate([old, elements[first // 12]])
-    return Finer(whole.reshape(-1, 6), nodes, np.concatenate([own, values[first % 12]]))
+    """Each triangle as four of the same kind, cut by the middles of its edges."""
+    return _divided(elements, count, element_of(elements), FOUR_PARTS)
 
 
-# The places of the six nodes of a triangle, and those of the corners and middles of its four parts that are among them.
-_PLACES = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+def enriched_elements(elements: np.ndarray, count: int) -> Finer:
+    """The finer elements by which the error of a mesh is estimated: six nodes in place of three, or four parts."""
+    return with_middle_nodes(elements, count) if element_of(elements) is TRIANGLE else cut_in_four(elements, count)
 
 
-_PARTS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+def _divided(elements: np.ndarray, count: int, target: Element, parts: np.ndarray) -> Finer:
+    """Elements of `count` nodes cut into `parts` `(c, 3, 3)`, given by their corners, each of the kind `target`.
+
+    Nodes keep their numbers, and new ones follow.
+    """
+    old = element_of(elements)
+    places = np.einsum("kp,cpl->ckl", target.places, parts).reshape(-1, 3)
+    # Parts share nodes with each other, and elements with their neighbours. A node is known by the corners of its
+    # element that it lies between, with their weights in quarters.
+    quarters = np.round(4 * places).astype(np.int64)
+    keys = np.sort(np.where(quarters > 0, elements[:, None, :3].astype(np.int64) * 4 + quarters, -1), axis=2)
+    same = (np.abs(places[:, None] - old.places).max(axis=2) < 0.125).T
+    known, which = same.any(axis=0), same.argmax(axis=0)
+    whole = np.empty((len(elements), len(places)), np.int64)
+    whole[:, known] = elements[:, which[known]]
+    rows = keys[:, ~known].reshape(-1, 3)
+    _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    new = int((~known).sum())
+    whole[:, ~known] = count + number.reshape(-1, new)
+    nodes = np.concatenate([np.repeat(np.arange(count)[:, None], old.nodes, axis=1), elements[first // new]])
+    own = np.tile(np.eye(1, old.nodes), (count, 1))
+    weights = np.concatenate([own, old.shape(places[~known])[first % new]])
+    return Finer(whole.reshape(-1, target.nodes), nodes, weights)
 
 
 def _made(mesh: Mesh, finer: Finer) -> Mesh:

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 
 from jaxbeam.core.tree import Key, is_concrete, key_of, read_only
-from jaxbeam.mesh.elements import EDGES
+from jaxbeam.mesh.elements import edge_functions, element_of
 from jaxbeam.mesh.mesh import Mesh
 
 # Gauss's rule of two points on (0, 1): exact for a shape function times the tent.
@@ -43,7 +43,7 @@ def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
     for line, s, length, share in walk(positions, surface(mesh), node, width):
         xi = share * _POINTS
         tent = 0.5 * share * length * (1 - (s + length * xi) / width)
-        for number, values in zip(line, _line_functions(len(line), xi), strict=True):
+        for number, values in zip(line, edge_functions(len(line), xi).T, strict=True):
             weights[number] = weights.get(number, 0.0) + float(tent @ values)
     nodes, values = np.array(list(weights)), np.array(list(weights.values()))
     return nodes, values / values.sum()
@@ -87,15 +87,8 @@ def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
     if not bodies:
         return read_only(np.zeros((0, 2)), np.int32)
     triangles = np.concatenate([body.array for body in bodies])
-    sides = [[triangles[:, a], triangles[:, b], *triangles.T[3 + k :][:1]] for k, (a, b) in enumerate(EDGES)]
-    every = np.stack([np.stack(side, axis=1) for side in sides], axis=1).reshape(-1, 2 + (triangles.shape[1] == 6))
+    edges = element_of(triangles).edges
+    every = triangles[:, edges].reshape(-1, len(edges[0]))
     low, high = np.sort(every[:, :2].astype(np.int64), axis=1).T
     _, number, count = np.unique(low * (triangles.max() + 1) + high, return_inverse=True, return_counts=True)
     return read_only(every[count[number] == 1])
-
-
-def _line_functions(nodes: int, xi: np.ndarray) -> list[np.ndarray]:
-    """The shape functions of an edge, at `xi` from its first corner (0) to its second (1)."""
-    if nodes == 2:
-        return [1 - xi, xi]
-    return [(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace
-from jaxbeam.mesh.elements import degree_of, rule, shape_slopes
+from jaxbeam.mesh.elements import degree_of, element_of, rule
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.physics import quadrature
 from jaxbeam.physics.energy import Energy, Term
@@ -124,10 +124,10 @@ def solid(
     material = jax.tree_util.tree_map_with_path(per_element, params)
     check_density(density, material)
     rest = xp.asarray(mesh.nodes)[mesh.elements]
-    usual = 1 if rest.shape[1] == 3 else 2
-    points, shares = rule(usual if degree is None else checks.count("degree", degree, 1))
+    element = element_of(mesh.elements)
+    points, shares = rule(element.degree if degree is None else checks.count("degree", degree, 1))
     # How a triangle is mapped from the reference one, and the inverse of that, at each point.
-    slopes = xp.asarray(shape_slopes(rest.shape[1], points), dtype)
+    slopes = xp.asarray(element.slopes(points), dtype)
     map_ = xp.einsum("mkd,qki->mqdi", rest, slopes)
     determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
     inverse = xp.stack([map_[..., 1, 1], -map_[..., 0, 1], -map_[..., 1, 0], map_[..., 0, 0]], axis=-1)

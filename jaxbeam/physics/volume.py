@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxbeam.mesh.bernstein import least_ratio, minimiser, value
-from jaxbeam.mesh.elements import corner_slopes, determinants, is_affine
+from jaxbeam.mesh.elements import corner_slopes, determinants, element_of
 from jaxbeam.physics.quadrature import SolidParams, interpolated, shape_gradients
 
 
@@ -28,7 +28,7 @@ def smallest_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
     With six nodes it is the smallest ratio of two quadratic polynomials: by how much the present map and that of the
     rest positions stretch area. Positive just when no part of the element is turned inside out.
     """
-    if is_affine(x.shape[1]):
+    if element_of(x).affine:
         return jnp.min(volume_ratios(x, params), axis=0)
     area = _rest_areas(params)
     present, rest = (corner_slopes(jnp.moveaxis(places, 0, -1)) for places in (x, params.rest))
@@ -38,7 +38,7 @@ def smallest_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
 def rest_is_sound(params: SolidParams) -> jax.Array:
     """Whether each element `(m,)` has positive area, and none of it is turned inside out, at rest."""
     positive = jnp.all(params.weights > 0, axis=1)
-    if is_affine(params.rest.shape[1]):
+    if element_of(params.rest).affine:
         return positive
     slopes = corner_slopes(jnp.moveaxis(params.rest, 0, -1))
     stretch = jnp.stack(determinants(slopes, slopes)) / _rest_areas(params)
@@ -73,7 +73,7 @@ def admissible_step(
     b = F11 * D[0, 0] + F00 * D[1, 1] - H[1, 0] * D[0, 1] - H[0, 1] * D[1, 0]
     c = D[0, 0] * D[1, 1] - D[0, 1] * D[1, 0]
     at_points = _first_crossing((1 - keep) * j, b, c, j > bound)
-    return at_points if is_affine(x.shape[1]) else _step_within(at_points, x, dx, params, keep, inside)
+    return at_points if element_of(x).affine else _step_within(at_points, x, dx, params, keep, inside)
 
 
 def _step_within(

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 
 from jaxbeam.core.tree import Numbers
-from jaxbeam.mesh.elements import EDGES, shape_functions
+from jaxbeam.mesh.elements import ELEMENTS, edge_functions, element_of
 from jaxbeam.mesh.surface import surface, walk
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene
@@ -33,22 +33,19 @@ def outline(scene: Scene) -> np.ndarray:
 
 def edge_curves(x: np.ndarray, edges: np.ndarray, shares: Numbers = 1.0) -> np.ndarray:
     """Points `(e, p, 2)` along edges; of each, only along the first part of it if its share `(e,)` is less than 1."""
-    nodes = edges.shape[1]
-    xi = np.expand_dims(shares, -1) * np.linspace(0, 1, POINTS if nodes == 3 else 2)
-    line = np.stack([1 - xi, xi, 0 * xi], axis=-1).reshape(-1, 3)
-    functions = shape_functions(3 * nodes - 3, line)[:, [0, 1, 3][:nodes]]
-    return functions.reshape(*xi.shape, nodes) @ x[edges, :2]
+    xi = np.expand_dims(shares, -1) * np.linspace(0, 1, POINTS if edges.shape[1] == 3 else 2)
+    return edge_functions(edges.shape[1], xi) @ x[edges, :2]
 
 
 def rings(x: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Points `(t, p, 2)` around each element, in its order; of an element of two nodes, its ends."""
-    nodes = elements.shape[1]
-    if nodes == 2:
+    if elements.shape[1] not in ELEMENTS:
         return x[elements, :2]
-    xi = np.linspace(0, 1, POINTS if nodes == 6 else 2)[:-1, None]
-    corners = np.eye(3)
-    around = np.concatenate([(1 - xi) * corners[a] + xi * corners[b] for a, b in EDGES])
-    return shape_functions(nodes, around) @ x[elements, :2]
+    edges = element_of(elements).edges
+    xi = np.linspace(0, 1, POINTS if len(edges[0]) == 3 else 2)[:-1]
+    # (t, e, p, 2): along each edge up to where the next begins.
+    around = np.einsum("pk,tekd->tepd", edge_functions(len(edges[0]), xi), x[elements[:, edges], :2])
+    return around.reshape(len(elements), -1, 2)
 
 
 def drawn_terms(scene: Scene) -> list[tuple[Term, np.ndarray]]:

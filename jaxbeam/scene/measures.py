@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.mesh.elements import EDGES, degree_of, rule
+from jaxbeam.mesh.elements import Element, degree_of, element_of, rule
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene, placed
 
@@ -111,7 +111,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     x = placed(scene, x)
     total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
     for term, stress in _at_points(scene, x, _stress):
-        recover = jnp.asarray(_points_to_nodes(term.nodes.shape[1], stress.shape[1]), x.dtype)
+        recover = jnp.asarray(_points_to_nodes(element_of(term.nodes), stress.shape[1]), x.dtype)
         areas = jnp.sum(term.params.weights, axis=1)
         total = total.at[term.nodes].add(jnp.einsum("kq,mqij,m->mkij", recover, stress, areas))
         area = area.at[term.nodes].add(areas[:, None])
@@ -153,15 +153,13 @@ def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]
     return jnp.concatenate([mean(term.params.weights, values) for term, values in _at_points(scene, x, measure)])
 
 
-def _points_to_nodes(nodes: int, points: int) -> np.ndarray:
+def _points_to_nodes(element: Element, points: int) -> np.ndarray:
     """The matrix `(k, q)` from values at `q` quadrature points to those of the linear field that fits them best, at
     the `k` nodes of the element. Fewer than three points do not fix a linear field: of those that fit the least is
     taken, which for one point is constant."""
     places, shares = rule(degree_of(points))
     root = np.sqrt(shares)
-    at_corners = np.linalg.pinv(root[:, None] * places) * root
-    between = [(at_corners[a] + at_corners[b]) / 2 for a, b in EDGES]
-    return np.concatenate([at_corners, between])[:nodes]
+    return element.places @ (np.linalg.pinv(root[:, None] * places) * root)
 
 
 def _measured(scene: Scene, x: jax.Array, name: str) -> jax.Array:

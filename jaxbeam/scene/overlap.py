@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.mesh.elements import edge_functions
 from jaxbeam.scene.scene import Scene
 
 # Segments of a curved edge.
@@ -49,18 +50,13 @@ def _of_solids(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     edges = jnp.asarray(scene.surface)
     parts = 1 if edges.shape[1] == 2 else SEGMENTS
     xi = np.linspace(0, 1, parts + 1)
-    functions = np.stack([1 - xi, xi], 1) if parts == 1 else _parabola(xi)
+    functions = edge_functions(edges.shape[1], xi)
     curves = jnp.einsum("pk,ekd->epd", jnp.asarray(functions, x.dtype), x[edges, :2])
     # Points between the ends of an edge are numbered after the nodes.
     between = len(x) + jnp.arange(len(edges) * (parts - 1), dtype=jnp.int32).reshape(len(edges), parts - 1)
     numbers = jnp.concatenate([edges[:, :1], between, edges[:, 1:2]], axis=1)
     pairs = lambda each: jnp.stack([each[:, :-1], each[:, 1:]], axis=2).reshape(-1, 2, *each.shape[2:])
     return pairs(curves), pairs(numbers), jnp.repeat(edges[:, :2], parts, axis=0)
-
-
-def _parabola(xi: np.ndarray) -> np.ndarray:
-    """Shape functions `(p, 3)` of an edge of three nodes, its ends first, at `xi` from 0 to 1."""
-    return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=1)
 
 
 def _of_sides(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array, jax.Array]]:

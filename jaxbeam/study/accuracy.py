@@ -26,8 +26,9 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import is_concrete, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
-from jaxbeam.mesh.refinement import Finer, cut_in_four, with_middle_nodes
+from jaxbeam.mesh.refinement import Finer, enriched_elements
 from jaxbeam.mesh.surface import surface
 from jaxbeam.physics.energy import NotRefinable, Term
 from jaxbeam.scene.scene import Scene, check_scene, evaluate, stencil_hessians
@@ -36,11 +37,6 @@ from jaxbeam.solve.newton import Newton, check_asked, topology
 from jaxbeam.solve.solution import Solution
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
-
-
-# By how much the change that a finer mesh makes falls short of the error: from triangles of three nodes to six hardly,
-# from six-node triangles to smaller ones by what the corners of the clamp leave, where the stress is infinite.
-SHORT_OF = {3: 1.0, 6: 1.5}
 
 
 # What the estimate is multiplied by to bound the error.
@@ -166,10 +162,9 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     if not is_concrete(*jax.tree.leaves(scene)):
         raise ValueError("scene: expected concrete numbers to refine a mesh of, got traced ones; call outside jit")
     elements, count = scene.mesh.elements, scene.mesh.nodes.shape[0]
-    if elements.shape[1] not in (3, 6):
+    if scene.mesh.radian is not None:
         raise ValueError("scene: expected a mesh of triangles to refine, got a rod, whose error is that of its model")
-    coarse = elements.shape[1] == 3
-    finer = (with_middle_nodes if coarse else cut_in_four)(elements, count)
+    finer = enriched_elements(elements, count)
     mesh = Mesh(finer.carry(np.asarray(scene.mesh.nodes)), finer.elements)
     used = finer.weights != 0
     # A new node is fixed, or of the tip, if it lies on the surface between nodes that are.
@@ -217,7 +212,7 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
         # Too far for bare steps: it takes a solve.
         found = equilibrium(finer, start, solver)
         moved, change = np.asarray(found.x), float(measure(finer, found.x)) - value if found.status == 0 else np.nan
-    left = change * SHORT_OF[scene.mesh.elements.shape[1]]
+    left = change * element_of(scene.mesh.elements).shortfall
     reason = _doubt(scene, solution, change)
     bar = np.inf if reason else SAFETY * abs(left) + UNLIKE * cancelled + abs(algebraic)
     return ErrorEstimate(value, left, algebraic, bar, reason), finer, moved

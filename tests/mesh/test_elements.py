@@ -7,8 +7,49 @@ import pytest
 from helpers import EPS, central_difference
 
 import jaxbeam as jb
+from jaxbeam.mesh.elements import DEGREES, ELEMENTS, rule
 from jaxbeam.physics.volume import admissible_step, smallest_ratios, volume_ratios
 from jaxbeam.scene.scene import is_valid
+
+# ------------------------------------------------------------------------------- rules and shape functions
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_rule_is_exact_up_to_its_degree(degree):
+    """Against `int l0^a l1^b l2^c = a! b! c! 2 A / (a + b + c + 2)!`, and not beyond."""
+    from math import factorial
+
+    points, weights = rule(degree)
+    assert weights.sum() == pytest.approx(1, abs=1e-14) and (weights > 0).all()
+    off = {}
+    for total in range(degree + 2):
+        for a in range(total + 1):
+            b = total - a
+            exact = 2 * factorial(a) * factorial(b) / factorial(total + 2)
+            off[total] = max(off.get(total, 0), abs(weights @ (points[:, 0] ** a * points[:, 1] ** b) - exact))
+    assert max(off[total] for total in range(degree + 1)) < 1e-14 < 1e-5 < off[degree + 1]
+
+
+@pytest.mark.parametrize("element", ELEMENTS.values(), ids=ELEMENTS)
+def test_shape_functions(element):
+    """One at their own node and zero at the others; they add up to 1; slopes are those of the functions."""
+    np.testing.assert_allclose(element.shape(element.places), np.eye(element.nodes), atol=1e-15)
+    points = np.random.default_rng(0).dirichlet(np.ones(3), 20)
+    np.testing.assert_allclose(element.shape(points).sum(axis=1), 1, atol=1e-14)
+    h = 1e-6
+    for axis, step in enumerate(np.array([[-1, 1, 0], [-1, 0, 1]]) * h):
+        slope = (element.shape(points + step) - element.shape(points - step)) / (2 * h)
+        np.testing.assert_allclose(element.slopes(points)[:, :, axis], slope, atol=1e-9)
+
+
+@pytest.mark.parametrize("element", ELEMENTS.values(), ids=ELEMENTS)
+def test_edges_go_round_the_element(element):
+    """Each begins where the one before ended, and what lies between its ends is half-way."""
+    for edge, following in zip(element.edges, element.edges[1:] + element.edges[:1], strict=True):
+        assert edge[1] == following[0]
+        for node in edge[2:]:
+            np.testing.assert_array_equal(element.places[node], element.places[list(edge[:2])].mean(axis=0))
+
 
 smallest = jax.jit(smallest_ratios)
 longest_step = jax.jit(admissible_step)

@@ -8,7 +8,7 @@ from helpers import disturbed, energy, forces, l_shape
 
 import jaxbeam as jb
 from jaxbeam.core.tree import replace
-from jaxbeam.mesh.elements import DEGREES, rule, shape_functions, shape_slopes
+from jaxbeam.mesh.elements import rule
 from jaxbeam.mesh.surface import patch, surface
 from jaxbeam.physics.volume import volume_ratios
 
@@ -28,36 +28,7 @@ def area(mesh):
     return float(np.sum(jb.solid(mesh, jb.lame(1.0, 0.3)).params.weights))
 
 
-# ------------------------------------------------------------------------------------- shape functions
-
-
-@pytest.mark.parametrize("degree", DEGREES)
-def test_rule_is_exact_up_to_its_degree(degree):
-    """Against `int l0^a l1^b l2^c = a! b! c! 2 A / (a + b + c + 2)!`, and not beyond."""
-    from math import factorial
-
-    points, weights = rule(degree)
-    assert weights.sum() == pytest.approx(1, abs=1e-14) and (weights > 0).all()
-    off = {}
-    for total in range(degree + 2):
-        for a in range(total + 1):
-            b = total - a
-            exact = 2 * factorial(a) * factorial(b) / factorial(total + 2)
-            off[total] = max(off.get(total, 0), abs(weights @ (points[:, 0] ** a * points[:, 1] ** b) - exact))
-    assert max(off[total] for total in range(degree + 1)) < 1e-14 < 1e-5 < off[degree + 1]
-
-
-@pytest.mark.parametrize("nodes", [3, 6])
-def test_shape_functions(nodes):
-    """One at their own node and zero at the others; they add up to 1; slopes are those of the functions."""
-    places = np.concatenate([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])[:nodes]
-    np.testing.assert_allclose(shape_functions(nodes, places), np.eye(nodes), atol=1e-15)
-    points = np.random.default_rng(0).dirichlet(np.ones(3), 20)
-    np.testing.assert_allclose(shape_functions(nodes, points).sum(axis=1), 1, atol=1e-14)
-    h = 1e-6
-    for axis, step in enumerate(np.array([[-1, 1, 0], [-1, 0, 1]]) * h):
-        slope = (shape_functions(nodes, points + step) - shape_functions(nodes, points - step)) / (2 * h)
-        np.testing.assert_allclose(shape_slopes(nodes, points)[:, :, axis], slope, atol=1e-9)
+# --------------------------------------------------------------------------------------- finer meshes
 
 
 @pytest.mark.parametrize("name", MESHES)
