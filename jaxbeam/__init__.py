@@ -13,6 +13,9 @@ from jaxbeam.mesh.mesh import nodes_where as nodes_where
 from jaxbeam.mesh.rectangle import rectangle as rectangle
 from jaxbeam.mesh.refinement import quadratic as quadratic
 from jaxbeam.mesh.refinement import refined as refined
+from jaxbeam.physics.cable import cables as cables
+from jaxbeam.physics.energy import Energy as Energy
+from jaxbeam.physics.energy import NotRefinable as NotRefinable
 from jaxbeam.physics.energy import Term as Term
 from jaxbeam.physics.load import dead_load as dead_load
 from jaxbeam.physics.materials import Lame as Lame

@@ -11,7 +11,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout
-from jaxbeam.scene.scene import Scene, command
+from jaxbeam.scene.scene import Scene, command, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
@@ -21,28 +21,35 @@ from jaxbeam.solve.solution import Solution
 
 
 @usual_rules
-def commands(ratios: Numbers, steps: int = 28) -> jax.Array:
-    """The commands `(steps, m)` of a ramp: evenly spaced from ratio 1 to `ratios` `(m,)`.
+def commands(ratios: Numbers, steps: int = 28, start: Numbers | None = None) -> jax.Array:
+    """The commands `(steps, m)` of a ramp: evenly spaced from `start` to `ratios` `(m,)`.
+
+    Args:
+        ratios: the last command.
+        steps: how many commands, at least 2.
+        start: the first command, `()` or `(m,)`; by default ratio 1, the rest of tendons.
 
     Raises:
-        ValueError: if `steps` is not a whole number of at least 2, or a concrete ratio is not positive and finite.
+        ValueError: if `steps` is not a whole number of at least 2, or a concrete ratio is not positive and finite (not
+            finite, if a start is given).
 
     >>> [float(r) for r in commands([0.5], steps=3)[:, 0]]
     [1.0, 0.75, 0.5]
     """
     checks.count("steps", steps, 2)
-    end = checks.numbers("ratios", ratios, checks.POSITIVE)
+    end = checks.numbers("ratios", ratios, checks.POSITIVE if start is None else checks.FINITE)
     if end.ndim != 1:
         raise ValueError(f"ratios: expected shape (m,), one for each tendon, got {end.shape}")
     end = end if end.dtype.kind == "f" else end.astype(jnp.result_type(float))
+    first = np.ones((), end.dtype) if start is None else checks.numbers("start", start, shapes=((), end.shape))
     way = np.linspace(0.0, 1.0, steps).astype(end.dtype)[:, None]
-    # Weighted, not 1 + way * (end - 1), so that the last command is `ratios` to the last bit.
-    return to_device((1 - way) + way * end)
+    # Weighted, not start + way * (end - start), so that the last command is `ratios` to the last bit.
+    return to_device((1 - way) * first.astype(end.dtype) + way * end)
 
 
 @usual_rules
 def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
-    """Equilibria on the way from ratio 1 to `ratios`, each started from the one before.
+    """Equilibria on the way from rest to the command `ratios`, each started from the one before.
 
     What a beam does when its tendons are pulled slowly: where an equilibrium depends on the path, this is
     the one a user sees. Each start is predicted from the states before and their tangents.
@@ -71,10 +78,13 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     if is_concrete(end, *jax.tree.leaves(scene)):
         return _ramp(open_scene, layout, end, steps, solver)
     path = _ramp(*lax.stop_gradient((open_scene, layout, end)), steps, solver)
-    return differentiable_rows(open_scene, layout, commands(end, steps), path, solver)
+    return differentiable_rows(open_scene, layout, commands(end, steps, rest_commands(scene)), path, solver)
 
 
 @compiled("steps", "solver")
 def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
     targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
-    return follow(lambda s: command(scene, (1 - s) + s * end), layout, begin(scene.mesh.nodes), targets, solver)[0]
+    rest = rest_commands(scene)
+    return follow(lambda s: command(scene, (1 - s) * rest + s * end), layout, begin(scene.mesh.nodes), targets, solver)[
+        0
+    ]

@@ -1,0 +1,100 @@
+"""Cables: tendons that only pull. A slack cable has no force and no energy.
+
+With the stretch `s = l - l*` of a cable, beyond its commanded length, the energy is
+
+    k w^2 h(s / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1),
+
+so that over the transition width `w` the stiffness rises in proportion from 0 to `k`. Energy, tension and stiffness are
+continuous, as Newton's method needs it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace, pytree
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.physics.energy import Term
+from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, tendons
+
+
+@pytree
+class CableParams(TendonParams):
+    """Those of a tendon, and `transition` `(m,)`: the stretch over which a slack cable becomes taut."""
+
+    transition: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CableEnergy(TendonEnergy):
+    """A tendon that pulls and does not push."""
+
+    name: ClassVar[str] = "cable"
+
+    def __call__(self, x: jax.Array, params: Any) -> jax.Array:
+        t = self._stretch(x, params)
+        rising, taut = jnp.clip(t, 0, 1), jnp.maximum(t, 1)
+        shape = jnp.where(t < 1, rising**3 / 6, 0.5 * (taut - 0.5) ** 2 + 1 / 24)
+        return self.stiffness(params.modulus, params.commanded) * params.transition**2 * shape
+
+    def tension(self, x: jax.Array, params: Any) -> jax.Array:
+        """`dE/dl` `()`: zero when slack, else positive."""
+        t = self._stretch(x, params)
+        shape = jnp.where(t < 1, 0.5 * jnp.clip(t, 0, 1) ** 2, jnp.maximum(t, 1) - 0.5)
+        return self.stiffness(params.modulus, params.commanded) * params.transition * shape
+
+    def _stretch(self, x: jax.Array, params: Any) -> jax.Array:
+        """How far it is stretched beyond its commanded length, over the width of the transition."""
+        return (self.length(x, params) - params.commanded) / params.transition
+
+    def valid(self, params: Any) -> jax.Array:
+        return super().valid(params) & jnp.all(params.transition > 0)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        finer = super().refined(term, mesh, parts)
+        return finer if finer is term else _as_cables(finer, self.stiffness, term.params.transition)
+
+
+@usual_rules
+def cables(
+    mesh: Mesh,
+    nodes: Numbers,
+    modulus: Numbers,
+    stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
+    width: Numbers = 0.0,
+    transition: Numbers = 0.01,
+) -> Term:
+    """Tendons that only pull, at their natural length (ratio 1); `command` shortens them.
+
+    Args:
+        mesh: as for `tendons`.
+        nodes: as for `tendons`.
+        modulus: as for `tendons`.
+        stiffness: as for `tendons`.
+        width: as for `tendons`.
+        transition: the stretch, over the natural length, within which a cable becomes taut, positive; scalar or
+            `(m,)`; differentiable. The smaller, the sharper the change of stiffness that Newton's method has to cross.
+
+    Raises:
+        ValueError: as `tendons` does, or if a transition is not positive and finite.
+    """
+    term = tendons(mesh, nodes, modulus, stiffness, width)
+    shares = checks.numbers("transition", transition, checks.POSITIVE, ((), (len(term.nodes),)), "one for each cable")
+    natural = term.params.natural
+    xp = namespace(shares, natural)
+    return _as_cables(term, stiffness, xp.asarray(shares, mesh.nodes.dtype) * xp.asarray(natural))
+
+
+def _as_cables(term: Term, stiffness: Callable[[jax.Array, jax.Array], jax.Array], transition: Any) -> Term:
+    """Cables in place of two-way tendons. `transition` `(m,)` is a length."""
+    shared = {field.name: getattr(term.params, field.name) for field in dataclasses.fields(TendonParams)}
+    energy = CableEnergy(stiffness, term.kind.points)  # type: ignore[attr-defined]
+    return Term(energy, np.asarray(term.nodes), CableParams(**shared, transition=transition))
