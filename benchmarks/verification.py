@@ -12,8 +12,9 @@ Prints one table for each item, with the reference value, ours, the error and th
 - `orders`: how fast the error of a manufactured solution falls as the mesh is refined.
 
 Lengths of the slender beams are in units of their height; what separates them from beam theory, shear and finite
-strain, falls as its square over the length, and the tables show that. `tests/project/test_verification.py` asserts the figures
-that take seconds. scikit-fem and FElupe are installed by `pip install -e '.[bench]'`; without them `packages` says so.
+strain, falls as its square over the length, and the tables show that. `tests/project/test_verification.py` asserts the
+figures that take seconds. scikit-fem and FElupe are installed by `pip install -e '.[bench]'`; without them `packages`
+says so.
 """
 
 from __future__ import annotations
