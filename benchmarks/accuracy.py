@@ -1,6 +1,6 @@
 """Error against time: every model, order, mesh, anchor, precision and tolerance, and what to choose.
 
-    python -m benchmarks.accuracy [--quick] [--out out/benchmarks]
+    python -m benchmarks.accuracy [--quick] [--poisson 0.45 ...] [--crease]
 
 The reference beam with anchors of width 0.25, its top tendon pulled to ratios from 0.95 to 0.5, at Poisson's ratios
 from 0.3 to 0.4999. Errors of the tip angle and of the tendon's tension, in percent of a solution on a graded mesh of
@@ -9,8 +9,8 @@ the two counts. Times are of one call after compiling, medians, each beside one 
 point anchors, Poisson's ratio 0.45) to the same ratio in turn with it; at 0.4999 settings are ramped to the command,
 which a jump reaches in a hundred steps.
 
-For each it ends with the table a user chooses from, the cheapest setting for 10, 1, 0.1 and 0.01 % of error over all
-ratios, and the front of all of them is drawn.
+For each Poisson's ratio it ends with the table a user chooses from: the cheapest setting for 10, 1, 0.1 and 0.01 % of
+error over all ratios.
 
 Below a ratio of about 0.4, and of about 0.5 at a Poisson's ratio of 0.3, the surface under a tendon creases on fine
 meshes, a true instability of the material: no answer there is independent of the mesh, and none is compared. `--crease`
@@ -27,15 +27,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxbeam as jb
 from benchmarks import report
-from benchmarks.timing import medians
+from benchmarks.timing import in_turn
 
 RATIOS = (0.95, 0.8, 0.6, 0.5)
 POISSONS = (0.3, 0.45, 0.49, 0.499, 0.4999)
@@ -156,8 +152,8 @@ def references(poisson: float) -> tuple[np.ndarray, np.ndarray]:
 
 def timed(run: Callable[[], Any], ratio: float, repeats: int) -> dict[str, float]:
     """Milliseconds of a solve, and those over the time that one jump of the reference scene takes in turn with it."""
-    own, other = medians(run, partial(solved, jb.tendon_beam(), [ratio, 1.0]), repeats=repeats)
-    return {"ms": 1e3 * own.median, "over": own.median / other.median}
+    own, other = in_turn(run, partial(solved, jb.tendon_beam(), [ratio, 1.0]), repeats=repeats)
+    return {"ms": 1e3 * own.median, "over": own.over(other)}
 
 
 def errors(setting: Setting, poisson: float, truth: np.ndarray, repeats: int) -> list[dict[str, Any]]:
@@ -223,35 +219,6 @@ def choose(rows: list[dict[str, Any]], floor: float) -> list[tuple[Any, ...]]:
     return lines
 
 
-def draw(rows: list[dict[str, Any]]) -> Any:
-    """Error against time at each ratio for Poisson's ratio 0.45, and for 0.4999, with the front."""
-    poissons = [p for p in (0.45, 0.4999) if any(row["poisson"] == p for row in rows)]
-    figure, axes = plt.subplots(1, len(poissons), figsize=(6.2 * len(poissons), 5), sharey=True, squeeze=False)
-    families = {"by hand": "k*", "linear": "C7P", "rod": "C2D", "P1": "C0o", "P2": "C3s"}
-    for ax, poisson in zip(axes[0], poissons, strict=True):
-        entries = worst([row for row in rows if row["poisson"] == poisson])
-        for family, style in families.items():
-            own = [entry for entry in entries if entry[0].startswith(family)]
-            ax.loglog([time for *_, time in own], [error for _, error, _ in own], style, label=family, ms=7, alpha=0.8)
-        front, best = [], np.inf
-        for entry in sorted(entries, key=lambda entry: entry[2]):
-            # What is better by less than a quarter is not worth a name.
-            if entry[1] < 0.75 * best:
-                front.append(entry)
-                best = entry[1]
-        ax.loglog([time for *_, time in front], [error for _, error, _ in front], "k-", lw=0.8, zorder=0)
-        ax.set_xlim(left=ax.get_xlim()[0] / 6)
-        for k, (name, error, time) in enumerate(front):
-            # Below the front there is nothing, but for the axis beside the first.
-            where = {"xytext": (-6, -8), "ha": "right"} if k else {"xytext": (-4, 7)}
-            ax.annotate(name, (time, error), textcoords="offset points", fontsize=6.5, **where)
-        ax.set(title=f"Poisson's ratio {poisson}", xlabel="time of one solve over that of the reference scene")
-        ax.grid(alpha=0.3, which="both", lw=0.4)
-    axes[0, 0].set_ylabel("largest error of angle and tension, ratios 0.95 to 0.5 (%)")
-    axes[0, 0].legend(frameon=False)
-    return figure
-
-
 def crease() -> None:
     """Tension of the top tendon as its ratio falls, on a coarse and on a fine mesh."""
     ratios = np.linspace(1, 0.36, 65)
@@ -277,23 +244,18 @@ def main() -> None:
     if options.crease:
         crease()
         return
-    rows: list[dict[str, Any]] = []
-    floors = {}
     for poisson in options.poisson:
         truth, gap = references(poisson)
-        floors[poisson] = float(np.nanmax(np.abs(100 * gap / truth)[:, :2]) / 3)
+        floor = float(np.nanmax(np.abs(100 * gap / truth)[:, :2]) / 3)
         print(f"nu = {poisson}: angle, tension, length at {RATIOS}:\n{np.round(truth, 5)}")
-        print(f"error of this reference, a third of its distance from half the fineness: {floors[poisson]:.4f} %\n")
+        print(f"error of this reference, a third of its distance from half the fineness: {floor:.4f} %\n")
         repeats = 3 if options.quick else 7
-        found = hand(poisson, truth, repeats)
+        rows = hand(poisson, truth, repeats)
         for setting in settings(options.quick):
-            found += errors(setting, poisson, truth, repeats)
-        print_rows(found, poisson)
-        rows += found
+            rows += errors(setting, poisson, truth, repeats)
+        print_rows(rows, poisson)
         print("The cheapest setting for an error of angle and tension, over all ratios:\n")
-        report.table(("error", "setting", "error %", "over reference"), choose(found, floors[poisson]))
-    report.save(options.out, "accuracy", {"rows": rows, "reference": floors})
-    report.save_figure(options.out, "accuracy", draw(rows))
+        report.table(("error", "setting", "error %", "over reference"), choose(rows, floor))
 
 
 if __name__ == "__main__":

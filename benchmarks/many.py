@@ -1,12 +1,12 @@
-"""Many scenes: a sweep of 1,024 asymmetries, and the reachable set of 64 x 64 commands.
+"""Many scenes: a sweep of 1,024 asymmetries, beside other ways to solve them.
 
-    python -m benchmarks.many [--repeats 5] [--out out/benchmarks]
+    python -m benchmarks.many [--repeats 5]
 
 The sweep takes ratios (1 + d, 1 - d) with d in [-0.4, 0.4], each to a relative residual of 1e-9. In turn with it, in
-the same process: `lax.map` over `equilibrium` on every 16th of them, and simkit, which ramps each one in 28 steps, on
-four of them (see `benchmarks/simkit_peer.py`). Sweeps of 64 and of 4,096 asymmetries show whether a scene costs as
-much in a batch of any size, and what memory that takes. One thread, but for a table with all cores. Every answer is
-verified by code that shares nothing with the solvers.
+the same process: `lax.map` over `equilibrium` on every 16th of them. After them simkit ramps four of them in 28 steps
+each (see `benchmarks/simkit_peer.py`). Sweeps of 64 and of 4,096 asymmetries show whether a scene costs as much in a
+batch of any size. One thread, but for a table with all cores. Every answer of jaxbeam is verified by code that shares
+nothing with its solver.
 """
 
 from __future__ import annotations
@@ -19,19 +19,16 @@ import subprocess
 import sys
 import time
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from benchmarks import reference, report, simkit_peer
-from benchmarks.timing import medians, seconds
+from benchmarks.timing import in_turn
 
 CORES = os.cpu_count() or 1
-SAMPLE = slice(None, None, 16)
 SOLVER = jb.Newton(rtol=reference.RTOL)
 
 
@@ -50,23 +47,17 @@ def on(cores: int, scene: jb.Scene, rows: np.ndarray) -> jb.Solution:
         os.cpu_count = count
 
 
-def sweeps(repeats: int) -> dict[str, Any]:
-    """Seconds a scene of each way to solve many."""
+def sweeps(repeats: int) -> None:
+    """Print the time a scene of each way to solve many."""
     scene = jb.tendon_beam()
-    raw, rows = reference.problem(scene), asymmetries(1024)
+    raw, ways = reference.problem(scene), {count: asymmetries(count) for count in (1024, 64, 4096)}
     mapped = jax.jit(
         lambda rows: jax.lax.map(lambda row: jb.equilibrium(jb.command(scene, row), solver=SOLVER), rows),
         compiler_options={"xla_cpu_use_fusion_emitters": False},  # as the library's own
     )
-    few = jnp.asarray(rows[SAMPLE])
-    simkit_peer.build()
-    four = rows[[0, 300, 700, 1023]]
-    runs = {
-        "sweep of 1,024": (partial(on, 1, scene, rows), rows),
-        "sweep of 64": (partial(on, 1, scene, asymmetries(64)), asymmetries(64)),
-        "sweep of 4,096": (partial(on, 1, scene, asymmetries(4096)), asymmetries(4096)),
-        "lax.map over equilibrium": (lambda: mapped(few), rows[SAMPLE]),
-    }
+    few = ways[1024][::16]
+    runs = {f"sweep of {count:,}": (partial(on, 1, scene, way), way) for count, way in ways.items()}
+    runs["lax.map over equilibrium"] = (partial(mapped, jnp.asarray(few)), few)
     residuals: dict[str, float] = {}
     steps: dict[str, float] = {}
 
@@ -76,43 +67,29 @@ def sweeps(repeats: int) -> dict[str, Any]:
             residuals[name] = reference.verified(raw, way, found)
 
     checks = [partial(check, name, way) for name, (_, way) in runs.items()]
-    times = medians(*(run for run, _ in runs.values()), repeats=repeats, checks=checks)
+    times = in_turn(*(run for run, _ in runs.values()), repeats=repeats, checks=checks)
+    simkit_peer.build()
     simkit = []
-    for row in four:
+    for row in ways[1024][[0, 300, 700, 1023]]:
         start = time.perf_counter()
         simkit_peer.follow(tuple(row))
         simkit.append(time.perf_counter() - start)
     peer = float(np.median(simkit))
     each = {name: timing.median / len(way) for (name, (_, way)), timing in zip(runs.items(), times, strict=True)}
-    base, own = each["sweep of 1,024"], each["lax.map over equilibrium"]
-    results = [
-        {
-            "way": name,
-            "ms a scene": 1e3 * seconds,
-            "steps": steps[name],
-            "residual": residuals[name],
-            "simkit over it": peer / seconds,
-            "lax.map over it": own / seconds,
-            "one thread over it": base / seconds,
-        }
-        for name, seconds in each.items()
-    ]
-    results.append({"way": "simkit, 28-step ramps (4)", "ms a scene": 1e3 * peer})
-    return {"sweeps": results, "peak memory": report.peak_memory()}
+    own = each["lax.map over equilibrium"]
+    lines = [(n, 1e3 * s, steps[n], residuals[n], peer / s, own / s) for n, s in each.items()]
+    lines.append(("simkit, 28-step ramps (4)", 1e3 * peer, None, None, None, None))
+    report.table(("", "ms a scene", "steps", "residual", "simkit over it", "lax.map over it"), lines)
 
 
-def threads(repeats: int) -> dict[str, float]:
-    """Seconds of the sweep on one core and on all, in turn, where XLA may use them. The gain is a median of ratios."""
+def threads(repeats: int) -> tuple[float, float, float]:
+    """Seconds of the sweep on one core and on all, in turn, where XLA may use them, and the gain."""
     scene, rows = jb.tendon_beam(), asymmetries(1024)
-    runs = [partial(on, cores, scene, rows) for cores in (1, CORES)]
-    for run in runs:
-        run()
-    times = np.array([[seconds(run) for run in runs] for _ in range(repeats)])
-    one, all = np.median(times, axis=0)
-    return {"one thread": one, f"{CORES} threads": all, "gain": float(np.median(times[:, 0] / times[:, 1]))}
+    one, every = in_turn(*(partial(on, cores, scene, rows) for cores in (1, CORES)), repeats=repeats)
+    return one.median, every.median, one.over(every)
 
 
-def threads_apart(repeats: int) -> dict[str, float]:
+def threads_apart(repeats: int) -> tuple[float, float, float]:
     """The same in a new process: this one is kept to one thread."""
     script = f"import json; from benchmarks import many; print(json.dumps(many.threads({repeats})))"
     script = f"import jax; jax.config.update('jax_enable_x64', True); {script}"
@@ -120,56 +97,17 @@ def threads_apart(repeats: int) -> dict[str, float]:
     process = subprocess.run(
         [sys.executable, "-c", script], env=dict(os.environ) | settings, stdout=subprocess.PIPE, check=True, text=True
     )
-    return json.loads(process.stdout.splitlines()[-1])
+    return tuple(json.loads(process.stdout.splitlines()[-1]))
 
 
-def reachable(repeats: int, side: int = 64) -> tuple[dict[str, Any], Figure]:
-    """The map of a grid of commands, and what it took."""
-    scene = jb.tendon_beam()
-    values = np.linspace(0.4, 1.0, side)
-    rows = np.stack([a.ravel() for a in np.meshgrid(values, values, indexing="ij")], axis=1)
-    kept: list[jb.Solution] = []
-    (timing,) = medians(partial(on, 1, scene, rows), repeats=repeats, checks=[kept.append])
-    found = kept[-1]
-    good = np.asarray(found.status) == 0
-    raw = reference.problem(scene)
-    worst = max(reference.residual(raw, rows[k], np.asarray(found.x[k])) for k in np.flatnonzero(good)[::7])
-    angles = np.asarray(jax.vmap(lambda x: jb.tip_angle(scene, x))(found.x))
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
-    for ax, field, label, colours in (
-        (figure.add_subplot(1, 2, 1), np.where(good, angles, np.nan), "tip angle (degrees)", "RdBu_r"),
-        (figure.add_subplot(1, 2, 2), np.asarray(found.steps, float), "Newton steps", "viridis"),
-    ):
-        limits = {"vmin": -38, "vmax": 38} if colours == "RdBu_r" else {"vmin": 0, "vmax": 10}
-        shades = ax.pcolormesh(values, values, field.reshape(side, side).T, cmap=colours, **limits)
-        ax.set(xlabel="ratio of the top tendon", ylabel="ratio of the bottom tendon", aspect="equal")
-        figure.colorbar(shades, label=label, extend="neither" if colours == "RdBu_r" else "max")
-    outcome = {
-        "commands": len(rows),
-        "seconds, one thread": timing.median,
-        "solved": float(good.mean()),
-        "steps a scene": float(np.mean(found.steps)),
-        "residual": worst,
-    }
-    return outcome, figure
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Print the tables, draw the map."""
+def main() -> None:
+    """Print the tables."""
     parser = report.options(__doc__)
     parser.add_argument("--repeats", type=int, default=5, help="timed calls of each")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     report.head("Many scenes")
-    found = sweeps(options.repeats)
-    keys = list(found["sweeps"][0])
-    report.table(("", *keys[1:]), [tuple(row.get(key) for key in keys) for row in found["sweeps"]])
-    print(f"peak memory {found['peak memory'] / 2**20:.0f} MB\n")
-    found["threads"] = threads_apart(options.repeats)
-    report.table(tuple(found["threads"]), [tuple(found["threads"].values())])
-    outcome, figure = reachable(max(1, options.repeats // 2))
-    report.table(tuple(outcome), [tuple(outcome.values())])
-    report.save(options.out, "many", found | {"reachable set": outcome})
-    report.save_figure(options.out, "reachable_set", figure)
+    sweeps(options.repeats)
+    report.table(("", "one thread, s", f"{CORES} threads", "gain"), [("sweep", *threads_apart(options.repeats))])
 
 
 if __name__ == "__main__":

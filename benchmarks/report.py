@@ -1,12 +1,10 @@
-"""What every benchmark prints and saves: the machine and versions, tables, a JSON file and plots."""
+"""What every benchmark prints: the machine and versions, and tables."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
-import resource
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,15 +12,12 @@ from typing import Any
 import jax
 import numpy as np
 
-PACKAGES = ("jaxbeam", "jax", "jaxlib", "numpy", "scipy", "simkit", "cvxopt", "pypardiso", "mkl")
-OUT = Path("out/benchmarks")
+PACKAGES = ("jaxbeam", "jax", "jaxlib", "numpy", "scipy", "simkit")
 
 
 def options(description: str | None) -> argparse.ArgumentParser:
-    """A parser of the command line that knows `--out`."""
-    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for the JSON file and the plots")
-    return parser
+    """A parser of the command line that shows the first line of a module's description."""
+    return argparse.ArgumentParser(description=(description or "").partition("\n")[0])
 
 
 def machine() -> dict[str, str]:
@@ -80,33 +75,3 @@ def _cell(value: Any) -> str:
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
-
-
-def save(folder: Path, name: str, results: Any) -> None:
-    """Write `name.json` with the results and what they depend on."""
-    folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"machine": machine(), "results": results}, indent=1, default=_plain)
-    (folder / f"{name}.json").write_text(text + "\n")
-    print(f"wrote {folder / name}.json", flush=True)
-
-
-def _plain(value: Any) -> Any:
-    """Arrays and array numbers as what JSON knows."""
-    return np.asarray(value).tolist()
-
-
-def save_figure(folder: Path, name: str, figure: Any) -> None:
-    """Write a matplotlib figure as `name.png`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=150, bbox_inches="tight")
-    print(f"wrote {folder / name}.png", flush=True)
-
-
-def peak_memory() -> int:
-    """Bytes of memory that this process has used at most."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # Not getrusage, which on Linux counts the process that started this one.
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return 1024 * int(line.split()[1])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,7 +1,5 @@
 """The reference ramp in simkit 0.1.8: its own energies, its own Newton solver and line search.
 
-    python -m benchmarks.simkit_peer [--out out/benchmarks]
-
 The scene is that of simkit's tutorial 16, and it is built as that tutorial builds it: operators precomputed, the left
 edge held by simkit's penalty of 1e9, a ramp of 28 poses whose first is the rest state, each of the others solved by
 `simkit.solvers.newton_solver` from the one before, at most 40 iterations, projected Hessians, line search on, the
@@ -12,23 +10,19 @@ default tolerance 1e-6 (on the length of a step; simkit does not look at forces)
 - Both springs are one term of two edges with a prebuilt operator (simkit's `_z` functions), which is faster than the
   tutorial's two terms.
 
-What is timed is the solve alone. Printed for several settings of its solver: seconds, iterations, poses that stopped
-at the cap, poses that stopped because the line search cut the step, and residuals, by code that shares nothing with
-either library. Stopping there is not converging, and simkit says nothing about it: the penalty leaves energies of 1e10
-whose round-off hides the descent. Its exact Hessians (`psd=False`, which the tutorial offers for comparison) and full
-steps (`do_line_search=False`) reach 1e-9; both are reported.
+What is timed, by `benchmarks.single` and `benchmarks.many`, is the solve alone. Each pose is judged by code that shares
+nothing with either library: its residual, and whether it stopped at the cap or because the line search cut the step.
+Stopping there is not converging, and simkit says nothing about it: the penalty leaves energies of 1e10 whose round-off
+hides the descent. Its exact Hessians (`psd=False`, which the tutorial offers for comparison) with full steps
+(`do_line_search=False`) reach 1e-9. The penalty moves the tip by about 2e-6 degrees.
 """
 
 from __future__ import annotations
 
-import benchmarks.one_thread  # isort: skip # noqa: F401
-
-import time
 import warnings
 from functools import lru_cache
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import scipy.sparse
 
@@ -40,7 +34,7 @@ from simkit import energies
 from simkit.solvers import newton_solver
 
 import jaxbeam as jb
-from benchmarks import reference, report
+from benchmarks import reference
 
 MATERIAL = "macklin-mueller-neo-hookean"
 PENALTY = 1e9
@@ -53,24 +47,6 @@ class Settings(NamedTuple):
     max_iterations: int = 40
     exact: bool = False
     line_search: bool = True
-
-
-class Ramp(NamedTuple):
-    """What a ramp gave, with `S` poses (the first is at rest, and is not solved).
-
-    seconds: of the solve alone. iterations: of Newton's method, for each pose. capped: whether it stopped at the
-    cap. stalled: whether it stopped because the line search cut a step that was still too long to stop at.
-    residuals: of each pose. x: `(n, 2)` at the end.
-    """
-
-    seconds: float
-    iterations: list[int]
-    capped: list[bool]
-    stalled: list[bool]
-    residuals: list[float]
-    x: np.ndarray
-    tip_angle: float
-    tendon_lengths: np.ndarray
 
 
 class Beam(NamedTuple):
@@ -174,73 +150,19 @@ def follow(ratios: tuple[float, ...], steps: int = reference.STEPS, settings: Se
     return Path(states, reports)
 
 
-def judge(path: Path, ratios: tuple[float, ...], seconds: float, settings: Settings = Settings()) -> Ramp:
-    """How far each pose is from balance, and how its solve ended."""
+def judge(path: Path, ratios: tuple[float, ...], settings: Settings) -> dict[str, float]:
+    """Iterations of all poses, how many stopped at the cap or were stalled by the line search, the largest residual and
+    the tip angle at the end."""
     raw = build().raw
     states = [state.reshape(-1, 2) for state in path.states]
     # The last step of each pose: how long it was wanted, and how much of it the line search let through.
     wanted = np.array([np.linalg.norm(r["dx"][-1]) for r in path.reports])
     taken = wanted * np.array([r["alphas"][-1] for r in path.reports])
     way = reference.commands(ratios, len(states))
-    end = states[-1]
-    return Ramp(
-        seconds=seconds,
-        iterations=[0, *(len(r["dx"]) for r in path.reports)],
-        capped=[False, *(taken >= settings.tolerance).tolist()],
-        stalled=[False, *((taken < settings.tolerance) & (wanted >= settings.tolerance)).tolist()],
-        residuals=[reference.residual(raw, row, x) for row, x in zip(way, states, strict=True)],
-        x=end,
-        tip_angle=reference.tip_angle(raw, end),
-        tendon_lengths=np.linalg.norm(end[raw.tendons[0].lines[:, 0]] - end[raw.tendons[0].lines[:, 1]], axis=1),
-    )
-
-
-def ramp(ratios: tuple[float, ...], steps: int = reference.STEPS, settings: Settings = Settings()) -> Ramp:
-    """Pull the tendons from rest to `ratios` in `steps` poses, the first at rest."""
-    build()
-    start = time.perf_counter()
-    path = follow(ratios, steps, settings)
-    return judge(path, ratios, time.perf_counter() - start, settings)
-
-
-CHOICES = {
-    "as its tutorial": Settings(),
-    "exact Hessians": Settings(exact=True),
-    "exact, full steps": Settings(exact=True, line_search=False),
-    "exact, full steps, tolerance 1e-9": Settings(1e-9, exact=True, line_search=False),
-    "tolerance 1e-9, cap 200": Settings(1e-9, 200),
-}
-
-
-def row(name: str, found: Ramp) -> tuple:
-    """One line of the table."""
-    return (
-        name,
-        found.seconds,
-        sum(found.iterations),
-        max(found.iterations),
-        sum(found.capped),
-        sum(found.stalled),
-        max(found.residuals),
-        found.residuals[-1],
-        f"{found.tip_angle:.7f}",
-    )
-
-
-HEADER = ("simkit", "seconds", "iterations", "most", "capped", "stalled", "residual, worst", "at the end", "tip angle")
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Print the table."""
-    options = report.options(__doc__).parse_args(arguments)
-    report.head("The reference ramp in simkit")
-    ramp(reference.COMMAND, 2)
-    found = {name: ramp(reference.COMMAND, settings=settings) for name, settings in CHOICES.items()}
-    report.table(HEADER, [row(name, f) for name, f in found.items()])
-    print(f"the converged tip angle is {reference.TIP_ANGLE}; the penalty moves it by about 2e-6")
-    report.save(options.out, "simkit_peer", {name: f._asdict() for name, f in found.items()})
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    main()
+    return {
+        "steps": sum(len(r["dx"]) for r in path.reports),
+        "capped": int(np.sum(taken >= settings.tolerance)),
+        "stalled": int(np.sum((taken < settings.tolerance) & (wanted >= settings.tolerance))),
+        "residual": max(reference.residual(raw, row, x) for row, x in zip(way, states, strict=True)),
+        "tip angle": reference.tip_angle(raw, states[-1]),
+    }

@@ -10,28 +10,26 @@ import jax
 import numpy as np
 
 
-def seconds(run: Callable[..., Any], *arguments: Any) -> float:
-    """Time of one call, until its result is there."""
-    start = time.perf_counter()
-    jax.block_until_ready(run(*arguments))
-    return time.perf_counter() - start
-
-
 class Timing(NamedTuple):
-    """Seconds of the repeated calls of one function; `first`, which may compile, is not among them."""
+    """Seconds of each of the repeated calls of one function; `first`, which may compile, is not among them."""
 
-    median: float
-    smallest: float
-    lower: float
-    upper: float
+    calls: np.ndarray
     first: float
-    repeats: int
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.calls))
+
+    def over(self, other: Timing) -> float:
+        """The median ratio of the calls to those of `other` in turn with them: what slows both cancels."""
+        return float(np.median(self.calls / other.calls))
 
     def __str__(self) -> str:
-        return f"{1e3 * self.median:.3f} ms ({1e3 * self.lower:.3f} to {1e3 * self.upper:.3f})"
+        lower, upper = np.quantile(self.calls, [0.25, 0.75])
+        return f"{1e3 * self.median:.3f} ms ({1e3 * lower:.3f} to {1e3 * upper:.3f})"
 
 
-def medians(*runs: Callable[[], Any], repeats: int, checks: Sequence[Callable[[Any], object]] = ()) -> list[Timing]:
+def in_turn(*runs: Callable[[], Any], repeats: int, checks: Sequence[Callable[[Any], object]] = ()) -> list[Timing]:
     """Times of each of several functions, called in turn so that all meet the same machine.
 
     Args:
@@ -50,7 +48,4 @@ def medians(*runs: Callable[[], Any], repeats: int, checks: Sequence[Callable[[A
 
     first = [once(k) for k in range(len(runs))]
     times = np.array([[once(k) for k in range(len(runs))] for _ in range(repeats)])
-    return [
-        Timing(float(np.median(t)), float(t.min()), *(float(q) for q in np.quantile(t, [0.25, 0.75])), begin, repeats)
-        for t, begin in zip(times.T, first, strict=True)
-    ]
+    return [Timing(calls, begin) for calls, begin in zip(times.T, first, strict=True)]

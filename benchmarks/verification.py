@@ -19,7 +19,6 @@ says so.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
@@ -34,7 +33,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 import jaxbeam as jb
-from benchmarks.report import table, version
+from benchmarks.report import options, table, version
 from jaxbeam.mesh.elements import element_of, rule
 
 # --------------------------------------------------------------------------------- what several items need
@@ -551,7 +550,7 @@ ITEMS = {item.__name__: item for item in (cook, elastica, circle, euler, package
 
 def main() -> None:
     """Print the tables of the items named, or of all."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = options(__doc__)
     parser.add_argument("items", nargs="*", metavar="ITEM", help=f"of {', '.join(ITEMS)}; by default all")
     names = parser.parse_args().items
     unknown = sorted(set(names) - set(ITEMS))

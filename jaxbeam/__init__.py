@@ -1,9 +1,11 @@
 """jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
 
-Read it in order: elements -> mesh -> materials -> terms -> scene -> equilibrium -> actuation -> sweep -> measures ->
-design -> accuracy.
+Each folder is a room. Read them in the order core, mesh, physics, scene, linear, solve, study: a room imports only from
+rooms before it. The names below are all that a user needs.
 Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib.
 """
+
+from types import ModuleType as _ModuleType
 
 from jaxbeam.linear.dense import Dense as Dense
 from jaxbeam.linear.tridiagonal import BlockTridiagonal as BlockTridiagonal
@@ -78,3 +80,10 @@ from jaxbeam.study.stability import Modes as Modes
 from jaxbeam.study.stability import lowest_mode as lowest_mode
 
 __version__ = "0.1.0"
+
+# The names imported above. Those imports also make the rooms attributes of this module: they are left out.
+__all__ = sorted(name for name, value in globals().items() if name[0] != "_" and not isinstance(value, _ModuleType))
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -66,7 +66,7 @@ def test_commands_of_several_kinds_are_numbered_through():
     pulled = jb.command(SCENE, [40.0, 0.9])
     np.testing.assert_allclose(commands_of(pulled), [40, 0.9], rtol=1e-15)
     np.testing.assert_allclose(commands_of(partway(pulled, 0.25)), [10, 0.975], rtol=1e-15)
-    with pytest.raises(ValueError, match="positive finite numbers.*natural length"):
+    with pytest.raises(ValueError, match=r"positive finite numbers.*natural length"):
         jb.command(SCENE, [40.0, -0.9])
     jb.command(SCENE, [-40.0, 0.9])  # a wire may be told to push
 
@@ -84,7 +84,7 @@ def test_a_wire_pulls_with_its_command():
     slope = jax.grad(lambda t: jb.equilibrium(jb.command(SCENE, jnp.stack([t, 1.0]))).energy)(40.0)
     # The force balance of the solve leaves the energy's slope off by its square.
     np.testing.assert_allclose(slope, length, rtol=1e-9)
-    assert float(jb.tip_angle(pulled, found.x)) > 1
+    assert float(jb.tip_angle(pulled, found.x)) > 0.1
 
 
 def test_what_it_says_of_ranges_and_bounds_is_heard():
