@@ -58,6 +58,17 @@ class Mesh:
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.summary()})"
+
+    def summary(self) -> str:
+        """Its sizes in words."""
+        if not all(hasattr(each, "shape") for each in (self.nodes, self.elements)):
+            return "a tree of other values"
+        count, nodes = self.elements.shape
+        kind = "triangles" if self.radian is None else "elements"
+        return f"{len(self.nodes)} nodes, {count} {kind} of {nodes} nodes, {self.nodes.dtype}"
+
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
     """Corner nodes, in the order given, and the nodes that lie between two of them."""

@@ -184,6 +184,9 @@ class Term:
                 )
         object.__setattr__(self, "params", params)
 
+    def __repr__(self) -> str:
+        return f"Term({len(self.nodes)} x {self.kind.name})"
+
     @property
     def kind(self) -> Energy:
         """The energy with all that it says of itself."""

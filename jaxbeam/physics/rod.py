@@ -75,6 +75,7 @@ class RodEnergy(Energy):
     """
 
     density: Callable[[jax.Array, Any], jax.Array]
+    name: ClassVar[str] = "rod"
     body: ClassVar[bool] = True
     coordinates: ClassVar[int | None] = 3
 

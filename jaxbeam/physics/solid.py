@@ -32,6 +32,7 @@ class SolidEnergy(Energy):
     """Energy of one element: the density summed over its quadrature points. What must stay positive is `J`."""
 
     density: Density
+    name: ClassVar[str] = "solid"
     body: ClassVar[bool] = True
     fills: ClassVar[bool] = True
     coordinates: ClassVar[int | None] = 2

@@ -87,6 +87,16 @@ class Scene:
         bodies = tuple(key_of(term, "nodes") for term in self.terms if term.kind.fills)
         object.__setattr__(self, "surface", surface_of(bodies))
 
+    def __repr__(self) -> str:
+        # JAX builds trees of the same structure from anything.
+        if not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.fixed]):
+            return "Scene(a tree of other values)"
+        terms = ", ".join(f"{len(term.nodes)} x {term.kind.name}" for term in self.terms)
+        free = f"{int((~self.fixed).sum())} of {self.fixed.size} coordinates free"
+        commands = commands_of(self)
+        known = np.array2string(np.asarray(commands), precision=6) if is_concrete(commands) else "traced"
+        return f"Scene({self.mesh.summary()}; {terms}; {free}; commands {known})"
+
 
 def _check_dtype(number: int, term: Term, dtype: Any) -> None:
     """Refuse parameters of more digits than the nodes have: energies would have another dtype than positions."""

@@ -312,3 +312,16 @@ def test_parameters_may_be_any_pytree():
         found.append(jb.check(jb.equilibrium(scene, solver=jb.Newton(linear=jb.Dense()))).x)
     np.testing.assert_array_equal(*found)
     assert abs(found[0] - base.mesh.nodes).max() > 1e-3
+
+
+def test_a_scene_prints_as_a_summary(beam):
+    assert repr(jb.command(beam, [0.4, 1.0])) == (
+        "Scene(203 nodes, 336 triangles of 3 nodes, float64; 336 x solid, 2 x tendon; 392 of 406 coordinates free; "
+        "commands [0.4 1. ])"
+    )
+    assert repr(beam.mesh) == "Mesh(203 nodes, 336 triangles of 3 nodes, float64)"
+    assert "8 elements of 2 nodes" in repr(jb.rod_beam())
+    said = []
+    jax.eval_shape(lambda scene: said.append(repr(scene)), beam)
+    assert "commands traced" in said[0]
+    assert repr(jax.tree.map(lambda leaf: None, beam)) == "Scene(a tree of other values)"
