@@ -24,7 +24,7 @@ from jax import lax
 from jax.sharding import PartitionSpec
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import blank, compiled, usual_rules
+from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
 from jaxbeam.scene.scene import Scene, command, energy, partway
@@ -132,7 +132,7 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         known=no,
         anchor=jnp.full(size + 1, size, jnp.int32),
     )
-    nothing = blank(lambda: _continue(scene, layout, chunk, order[0], chunk.anchor[0], solver))
+    nothing = zeros_like_result(lambda: _continue(scene, layout, chunk, order[0], chunk.anchor[0], solver))
 
     def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
         chunk, all = carry
@@ -184,7 +184,7 @@ def _continue(scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, paren
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * here + s * ratios)
     trail = _trail(chunk, parent, ratios)
     one = jnp.ones((), chunk.x.dtype)
-    path, factor, after = follow(scene_at, layout, trail, one[None], solver, way=ahead(trail, one))
+    path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=ahead(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
     slope = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
     pull = lambda e: gather(layout, jax.jvp(slope, (ratios,), (e,))[1])
