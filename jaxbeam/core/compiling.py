@@ -1,4 +1,4 @@
-"""How programs are compiled and run: options of XLA, JAX's settings, and loops that do only what is wanted."""
+"""How programs are compiled and run: options of XLA, JAX's settings, and loops that skip what is not needed."""
 
 from __future__ import annotations
 
@@ -20,48 +20,54 @@ from jaxbeam.core.tree import T, is_concrete
 P = ParamSpec("P")
 
 
-def blank(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Zeros in the shape of what a function returns, which is traced and not run: a value to start a loop with."""
+def zeros_like_result(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Zeros in the shape of a function's result: a value to start a loop with. The function is traced, not run."""
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
 
 
-def once(wanted: jax.Array | bool, compute: Callable[..., T], otherwise: T, *arguments: Any) -> T:
-    """`compute(*arguments)` where that is `wanted`, and where it is not `otherwise`, at no cost.
+def compute_if(condition: jax.Array | bool, compute: Callable[..., T], otherwise: T, *arguments: Any) -> T:
+    """`compute(*arguments)` if the condition holds; else `otherwise`, at no cost.
 
-    A loop of at most one turn, and not `lax.cond`: under `vmap` a cond becomes a select, and every lane would always
-    pay. What it computes must depend on the arguments alone.
+    This is a loop of at most one iteration instead of `lax.cond`: under `vmap` a cond becomes a select, which computes
+    both sides in every lane.
+
+    Args:
+        condition: `()` traced, or a plain boolean, which is decided while tracing.
+        compute: must depend on its arguments alone.
+        otherwise: a tree of the same structure as its result.
+        arguments: of `compute`.
     """
-    if isinstance(wanted, bool):
-        return compute(*arguments) if wanted else otherwise
+    if isinstance(condition, bool):
+        return compute(*arguments) if condition else otherwise
 
-    def turn(carry: tuple[T, jax.Array]) -> tuple[T, jax.Array]:
-        # Tied to the loop's state: XLA moves what does not change out of a loop, and it would be computed always.
-        _, tied = lax.optimization_barrier((carry, arguments))
-        return compute(*tied), jnp.zeros((), bool)
+    def iteration(carry: tuple[T, jax.Array]) -> tuple[T, jax.Array]:
+        # Without the barrier XLA moves what does not change out of the loop, and computes it always.
+        _, inside = lax.optimization_barrier((carry, arguments))
+        return compute(*inside), jnp.zeros((), bool)
 
-    return lax.while_loop(lambda carry: carry[1], turn, (otherwise, wanted))[0]
+    return lax.while_loop(lambda carry: carry[1], iteration, (otherwise, condition))[0]
 
 
 def choose(condition: jax.Array, yes: T, no: T) -> T:
-    """One of two trees of the same structure, by a traced `()` boolean."""
+    """`jnp.where` for trees: one of two trees of the same structure, by a traced `()` boolean."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-# What makes XLA compile the solver's many small kernels in less than half the time, and they run no slower: its older
-# emitters, and no passes that search its loops for what there is not: anything to move out of them, or to drop. The
-# last one would split each sum in two, for a round-off that the line search is far above.
-_PASSES = "while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
+# With these options XLA compiles the solver's many small kernels in less than half the time, and they run no slower.
+# They select its older emitters. They disable two passes that find nothing in the solver's loops, and one that splits
+# each sum in two to lower a round-off that the line search allows for anyway.
+_DISABLED_PASSES = "while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
 
 
-_QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": _PASSES}
+_FAST_COMPILATION = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": _DISABLED_PASSES}
 
 
-# A later version may not know them.
-COMPILER_OPTIONS = _QUICKLY if (0, 10) <= jax.__version_info__ < (0, 11) else None
+# Other versions may not know these options.
+COMPILER_OPTIONS = _FAST_COMPILATION if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
-def _outside() -> bool:
-    """Whether this is run, not traced: what a jitted function returns is a tracer inside another one."""
+def _is_outermost() -> bool:
+    """Whether no transformation is under way. Inside one, a jitted function returns a tracer."""
     return is_concrete(_zero())
 
 
@@ -69,8 +75,8 @@ _zero = jax.jit(lambda: np.int32(0))
 
 
 @contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """Without Python's search for reference cycles, which finds none in what tracing makes and takes a tenth of it."""
+def _without_garbage_collection() -> Iterator[None]:
+    """Context without Python's search for reference cycles: it takes a tenth of the time of tracing and finds none."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -83,8 +89,8 @@ def _uncollected() -> Iterator[None]:
 def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: run under JAX's default rules for ranks, dtypes and transfers, whatever the user has set.
 
-    A user who forbids implicit promotion or transfers means their own code. Here arrays of different rank meet by
-    intention, and index arrays of a topology are sent to the device when they are first needed.
+    A user may forbid implicit promotion or transfers in their own code. This package relies on both: it combines arrays
+    of different rank, and sends the index arrays of a topology to the device when they are first needed.
     """
 
     @functools.wraps(function)
@@ -102,15 +108,15 @@ def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
 def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Decorator: `jax.jit` with static arguments of these names, for the solver's own entry points.
 
-    Called outside any transformation it is compiled with our own options, which JAX takes nowhere else. Under `vmap` it
-    solves lane after lane: batched, all lanes would do what any of them needs.
+    Outside jit, grad and vmap: compile with `COMPILER_OPTIONS`, which JAX accepts nowhere else. Under vmap: run the
+    lanes in sequence, because a batched while-loop runs every lane as long as the slowest.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
 
         @functools.wraps(function)
         def traced(**values: Any) -> T:
-            _refuse_varying(values)
+            _refuse_device_varying(values)
             return function(**values)
 
         inner = jax.jit(traced, static_argnames=static)
@@ -122,22 +128,22 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
         def call(*arguments: Any, **named: Any) -> T:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
-            if is_concrete(*jax.tree.leaves(values)) and _outside():
-                with _uncollected():
+            if is_concrete(*jax.tree.leaves(values)) and _is_outermost():
+                with _without_garbage_collection():
                     return outermost(**values, **settings)
-            in_turn = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))
-            return in_turn(values)
+            in_sequence = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))
+            return in_sequence(values)
 
         return call
 
     return decorate
 
 
-def _refuse_varying(values: Any) -> None:
-    """Refuse values that `jax.shard_map` marks as different on each device, which loops from constants do not take."""
+def _refuse_device_varying(values: Any) -> None:
+    """Refuse values that `jax.shard_map` marks as different on each device: a loop that starts from constants fails."""
     for leaf in jax.tree.leaves(values):
         kind = jax.typeof(leaf) if isinstance(leaf, Tracer) else None
-        # The second is its name from jax 0.10 on.
+        # The second name is that of jax 0.10 and later.
         if getattr(kind, "vma", None) or getattr(getattr(kind, "manual_axis_type", None), "varying", None):
             raise ValueError(
                 "jax.shard_map: the solver's loops start from constants, which its check of varying values refuses; "

@@ -1,11 +1,16 @@
-"""Along a path of scenes: as many Newton solves as it takes to get from one target to the next.
+"""Continuation: equilibria along a path of scenes, by as many Newton solves as it takes.
 
-A single equilibrium is the shortest of paths. One compiled program holds one Newton loop, whatever happens on the way.
+The path has a parameter `s`; an equilibrium is asked for at each of a few targets. A single equilibrium is a path with
+one target. All solves share one Newton loop in the compiled program, whatever happens on the way.
+
+An *attempt* is one Newton solve, from a predicted start. A state it converges to is *accepted*, unless it is a saddle
+to leave or may be reached from too far (`_judge`). An attempt that fails is followed by one with half the increment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,28 +22,32 @@ from jaxbeam.core.compiling import choose
 from jaxbeam.linear.layout import Layout
 from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, worst_element
-from jaxbeam.solve.newton import HALVINGS, INACCURATE, PROJECTED, STEPS, Newton, State, newton, no_factor
+from jaxbeam.solve import newton
+from jaxbeam.solve.newton import INACCURATE, Newton
 from jaxbeam.solve.predictor import Trail, ahead, extend
+from jaxbeam.solve.report import PackedReport, Report, pack, unpack, zeros
 from jaxbeam.solve.solution import Solution, Status
+from jaxbeam.solve.stiffness import zero_factor
 
-# Newton steps that the first attempt at a target may take: beyond this a shorter way is quicker. Each failure allows
-# the next as many more, for past a fold no way is short enough.
+# Newton steps of the first attempt at a target: if it takes more, a shorter increment is quicker. Each failure allows
+# the next attempt this many more, because past a fold no increment is short enough.
 ATTEMPT_STEPS = 60
 
 
-# Full steps at the beginning of an attempt from a predicted start, which need not lower the energy: beside a stiff
-# tendon the way down is a curved valley, and a search for lower energy crawls along it.
-FREE_STEPS = 8
+# First steps of an attempt from a predicted start, which need not lower the energy: beside a stiff tendon the energy
+# has a curved valley, and a line search crawls along it.
+FULL_STEPS = 8
 
 
-# Times that the way to a target is halved before it is given up, and saddles are left before one is kept.
+# Failed attempts at a target before it is given up.
 MAX_CUTS = 20
 
 
+# Saddles that are left, one after the other, before one is accepted.
 MAX_ESCAPES = 4
 
 
-# How far a saddle is left at first, over the size of the body.
+# Length of the first displacement from a saddle, over the size of the body.
 ESCAPE = 1e-3
 
 
@@ -46,38 +55,99 @@ ESCAPE = 1e-3
 MAX_ATTEMPTS = 100
 
 
-# What `Report.numbers` and `Report.counts` hold, in this order.
-NUMBERS = ("energy", "residual", "correction", "smallest_jacobian", "reached")
+# ---------------------------------------------------------------------------------- state of a continuation
 
 
-COUNTS = ("steps", "projected", "halvings", "attempts", "worst_element", "status")
+class Problem(NamedTuple):
+    """What does not change during one continuation.
+
+    scene_at: from the parameter `s` to the scene, with unlocked indices.
+    layout: of its matrix.
+    targets: `(S,)` parameters at which an equilibrium is asked for, increasing.
+    valid: `(S,)` whether every parameter of the scene is in its range there.
+    noise: `(n, d)` random forces, to find soft modes with.
+    solver: settings.
+    """
+
+    scene_at: Callable[[jax.Array], Scene]
+    layout: Layout
+    targets: jax.Array
+    valid: jax.Array
+    noise: np.ndarray
+    solver: Newton
 
 
-class Report(NamedTuple):
-    """What is kept of an attempt: a `Solution` in few arrays, which make a small program."""
+class Spent(NamedTuple):
+    """What the attempts at the present target have taken so far; each an int32 `()`.
 
-    x: jax.Array
-    numbers: jax.Array
-    counts: jax.Array
+    steps: Newton steps.
+    projected: Newton steps with a modified stiffness.
+    halvings: halvings of the line search.
+    attempts: attempts.
+    status: flags of the last attempt.
+    """
+
+    steps: jax.Array
+    projected: jax.Array
+    halvings: jax.Array
+    attempts: jax.Array
+    status: jax.Array
 
 
-class Walk(NamedTuple):
-    """Where `follow` stands. The path's parameter is `s`; `trail` ends with the equilibrium found last."""
+class Continuation(NamedTuple):
+    """State of a continuation.
 
-    leg: jax.Array  # index of the target walked to
+    target: `()` index of the present target.
+    trail: the accepted states so far, with the parameter of each; the newest first.
+    accepted: `(n, d)` positions of the newest one as solved for. `trail` stores them with the last correction added.
+    parameter: `()` value of `s` at the next attempt.
+    start: `(n, d)` positions that the next attempt starts from.
+    displacement: `(n, d)` added to these: the predictor, or the way out of a saddle.
+    factor: of the stiffness at the end of the last attempt.
+    increment: `()` step in `s` from the newest accepted state.
+    cuts: `()` failed attempts at this target.
+    escapes: `()` saddles left since the newest accepted state.
+    spent: what this target has taken so far.
+    path: packed reports, with leading axis `S`.
+    given_up: `()` whether the target is given up. Then the next attempt takes no step: it only evaluates the newest
+        accepted state with the forces of the target.
+    running: `()` whether another attempt is to be made.
+    """
+
+    target: jax.Array
     trail: Trail
-    kept: jax.Array  # positions of that equilibrium as they were solved for, where `trail` has it a step ahead
-    trial: jax.Array  # parameter tried next
-    start: jax.Array  # positions it starts from, and the way ahead of them
-    way: jax.Array
-    factor: Any  # of the last attempt
+    accepted: jax.Array
+    parameter: jax.Array
+    start: jax.Array
+    displacement: jax.Array
+    factor: Any
     increment: jax.Array
-    cuts: jax.Array  # failures on the way to this target
+    cuts: jax.Array
     escapes: jax.Array
-    spent: jax.Array  # counts of the attempts at this target so far, and the last one's status
-    path: Report
-    over: jax.Array  # given up: what is left is to judge the last good state by the target's forces
+    spent: Spent
+    path: PackedReport
+    given_up: jax.Array
     running: jax.Array
+
+
+class Verdict(NamedTuple):
+    """What to make of an attempt; each `()`.
+
+    accepted: its state is one to continue from.
+    landed: it is accepted, and at the target.
+    saddle: it converged to a saddle, which is left.
+    failed: neither accepted nor a saddle.
+    give_up: the target is not reached, and no further attempt may be made.
+    """
+
+    accepted: jax.Array
+    landed: jax.Array
+    saddle: jax.Array
+    failed: jax.Array
+    give_up: jax.Array
+
+
+# ---------------------------------------------------------------------------------- init and step
 
 
 def follow(
@@ -87,179 +157,238 @@ def follow(
     targets: jax.Array,
     solver: Newton,
     x: jax.Array | None = None,
-    way: jax.Array | None = None,
+    displacement: jax.Array | None = None,
 ) -> tuple[Solution, Any, Trail]:
-    """Equilibria of `scene_at(s)` at each of the increasing `targets` `(S,)`, each started from the one before.
+    """Equilibria of `scene_at(s)` at each of the targets, each started from the one before.
 
-    The first attempt goes straight to the first target: from `x`, or else from the end of `trail` and `way` ahead of
-    it, by default along its tangent. One that fails is made in smaller steps, from the last good state (at first: the
-    newest of `trail`, at `s = 0`), along the branch as it was so far; steps grow again while they succeed. When they
-    have become too small the walk ends: what remains is reported `NOT_CONVERGED`, at the last good state. Returned with
-    them are the factor of the stiffness at the last, and the trail that ends there.
+    The first attempt goes straight to the first target. After one that fails the increment is halved, and the next
+    starts from the newest accepted state; the increment doubles while attempts succeed. When it has become too small
+    the continuation ends: the remaining targets are reported `NOT_CONVERGED`, at the newest accepted state.
+
+    Args:
+        scene_at: from the parameter to the scene, with unlocked indices.
+        layout: of its matrix.
+        trail: known states; the newest one, at `s = 0`, is in equilibrium or at rest.
+        targets: `(S,)` increasing parameters.
+        solver: settings.
+        x: `(n, d)` positions that the first attempt starts from; by default the newest state of `trail`.
+        displacement: `(n, d)` added to these; by default along the tangent of the trail, or zero with an `x`.
+
+    Returns:
+        The solutions, with leading axis `S`; the factor of the stiffness at the last; and the trail that ends there.
     """
-    last, rest = targets.shape[0] - 1, trail.x[0]
-    count, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), rest.dtype), jnp.asarray(False)
-    noise = np.random.default_rng(0).standard_normal(rest.shape).astype(rest.dtype)
     valid = jax.vmap(lambda s: is_valid(scene_at(s)))(targets)
-    blank_path = lambda *shape, dtype: jnp.zeros((last + 1, *shape), dtype)
-    path = Report(
-        x=blank_path(*rest.shape, dtype=rest.dtype),
-        numbers=blank_path(len(NUMBERS), dtype=rest.dtype),
-        counts=blank_path(len(COUNTS), dtype=jnp.int32),
-    )
+    noise = np.random.default_rng(0).standard_normal(trail.x[0].shape).astype(trail.x.dtype)
+    problem = Problem(scene_at, layout, targets, valid, noise, solver)
+    begin = init(problem, trail, x, displacement)
+    state = lax.while_loop(lambda state: state.running, partial(step, problem), begin)
+    return _solutions(problem, state), state.factor, state.trail
 
-    walk = Walk(
-        leg=count,
+
+def init(problem: Problem, trail: Trail, x: jax.Array | None, displacement: jax.Array | None) -> Continuation:
+    """The state before the first attempt; arguments as of `follow`."""
+    targets, newest = problem.targets, trail.x[0]
+    if displacement is None:
+        displacement = jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0)
+    zero, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
+    return Continuation(
+        target=zero,
         trail=trail,
-        kept=rest,
-        trial=targets[0],
-        start=rest if x is None else x,
-        way=jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0) if way is None else way,
-        factor=no_factor(layout, rest.dtype, solver),
+        accepted=newest,
+        parameter=targets[0],
+        start=newest if x is None else x,
+        displacement=displacement,
+        factor=zero_factor(problem.layout, newest.dtype, problem.solver.linear),
         increment=targets[0],
-        cuts=count,
-        escapes=count,
-        spent=jnp.zeros(len(COUNTS), jnp.int32),
-        path=path,
-        over=no,
+        cuts=zero,
+        escapes=zero,
+        spent=Spent(zero, zero, zero, zero, zero),
+        path=zeros(len(targets), newest),
+        given_up=no,
         running=~no,
     )
 
-    def attempt(walk: Walk) -> Walk:
-        trail, target, sound = walk.trail, targets[walk.leg], valid[walk.leg]
-        scene = scene_at(walk.trial)
-        budget = jnp.minimum(ATTEMPT_STEPS * (1 + walk.cuts), solver.max_steps - walk.spent[0])
-        slope_at = lambda s, x: jax.grad(energy, argnums=1)(scene_at(s), x)
-        rate = lambda x: jax.jvp(lambda s: slope_at(s, x), (walk.trial,), (zero + 1,))[1]
-        # What gives the tangent of the branch; at a saddle its soft modes, which the factor there filters out of noise.
-        probe = lambda x, definite: jnp.where(definite, rate(x), noise)
-        free = jnp.where(trail.depth > 0, FREE_STEPS, 0)
-        passing = walk.trial < targets[-1] if last else None
-        allowed = jnp.where(walk.over, 0, budget)
-        leaving = walk.escapes > 0
-        state = newton(scene, layout, walk.start, walk.way, allowed, free, passing, leaving, probe, solver)
-        numbers, counts = _report(scene, state, walk.spent, walk.over, sound, solver)
-        attempts, status = counts[3], counts[-1]
-        good, saddle, spent_out, may_cut = _judged(walk, state, counts, budget, sound, solver)
-        landed = good & (walk.trial == target)
-        failed = ~good & ~saddle
-        over = (~landed & spent_out) | (failed & ~may_cut)
 
-        known = state.stiffness.definite & jnp.all(jnp.isfinite(state.aside))
-        # The step that is not taken any more still tells where the branch lies, to twice as many digits as `rtol` asks
-        # for: a polynomial continued from there does not blow up what was left unbalanced.
-        settled = state.x + jnp.where(known & (state.correction <= INACCURATE), state.step, 0)
-        trail = choose(good, extend(trail, walk.trial, settled, state.aside, walk.way, known), trail)
-        kept = jnp.where(good, state.x, walk.kept)
-        cut = jnp.where(saddle, walk.increment, 0.5 * (walk.trial - trail.s[0]))
-        # A target reached at once invites to walk straight to the next one.
-        easy = landed & ((attempts == 1) | (walk.increment <= 0))
-        increment = jnp.where(easy, 1.0, jnp.where(good, 2 * walk.increment, cut)).astype(rest.dtype)
-        leg = jnp.minimum(walk.leg + landed.astype(jnp.int32), last)
-        # Landing a hair short of the target would leave a step of no length.
-        onward = trail.s[0] + increment
-        far = over | (trail.s[0] + 1.01 * increment >= targets[leg])
-        leave = saddle & ~over
-        trial = jnp.where(leave, walk.trial, jnp.where(far, targets[leg], onward))
-        off = ESCAPE * extent(scene) / jnp.max(jnp.abs(state.aside))
-        way = jnp.where(
-            leave, jnp.where(jnp.isfinite(off), off * state.aside, 0), jnp.where(over, 0, ahead(trail, trial))
-        )
-
-        # A target given up: where that is, as judged by the target's own forces.
-        reached = trail.s[0] / jnp.where(target > 0, target, 1)
-        entry = Report(state.x, jnp.append(numbers, jnp.where(walk.over, reached, 1)), counts)
-        written = landed | walk.over
-        path = jax.tree.map(
-            lambda all, new: all.at[walk.leg].set(jnp.where(written, new, all[walk.leg])), walk.path, entry
-        )
-        return Walk(
-            leg=leg,
-            trail=trail,
-            kept=kept,
-            trial=trial,
-            start=jnp.where(leave, state.x, jnp.where(over, kept, trail.x[0])),
-            way=way,
-            factor=state.stiffness.factor,
-            increment=increment,
-            cuts=jnp.where(landed & (status == 0), 0, walk.cuts + failed.astype(jnp.int32)),
-            escapes=jnp.where(good, 0, walk.escapes + saddle.astype(jnp.int32)),
-            spent=jnp.where(landed, 0, counts),
-            path=path,
-            over=over,
-            running=~walk.over & ~(landed & (walk.leg == last)),
-        )
-
-    walk = lax.while_loop(lambda walk: walk.running, attempt, walk)
-    # Where the walk ended before the last target, the targets after it are given up in the same state.
-    row = jnp.minimum(jnp.arange(last + 1, dtype=jnp.int32), walk.leg)
-    path = jax.tree.map(lambda all: all[row], walk.path)
-    ratios = jax.vmap(lambda s: commands_of(scene_at(s)))(targets)
-    crossed = lax.map(lambda x: crossing(scene_at(targets[0]), x), path.x)
-    return _solutions(path, ratios, crossed, solver), walk.factor, walk.trail
+def step(problem: Problem, state: Continuation) -> Continuation:
+    """Make one attempt, judge it, and choose the next one."""
+    scene = problem.scene_at(state.parameter)
+    max_steps = jnp.minimum(ATTEMPT_STEPS * (1 + state.cuts), problem.solver.max_steps - state.spent.steps)
+    attempt = _attempt(problem, state, scene, max_steps)
+    report = _report(problem, state, scene, attempt)
+    verdict = _judge(problem, state, attempt, report, max_steps)
+    trail = _extend(state, attempt, verdict)
+    accepted = jnp.where(verdict.accepted, attempt.x, state.accepted)
+    target, parameter, increment = _next_parameter(problem, state, verdict, report, trail)
+    start, displacement = _next_start(state, scene, attempt, verdict, trail, accepted, parameter)
+    spent = Spent(*(getattr(report, name) for name in Spent._fields))
+    return Continuation(
+        target=target,
+        trail=trail,
+        accepted=accepted,
+        parameter=parameter,
+        start=start,
+        displacement=displacement,
+        factor=attempt.stiffness.factor,
+        increment=increment,
+        cuts=jnp.where(verdict.landed & (report.status == 0), 0, state.cuts + verdict.failed.astype(jnp.int32)),
+        escapes=jnp.where(verdict.accepted, 0, state.escapes + verdict.saddle.astype(jnp.int32)),
+        spent=jax.tree.map(lambda count: jnp.where(verdict.landed, 0, count), spent),
+        path=_write(state, report, verdict.landed | state.given_up),
+        given_up=verdict.give_up,
+        running=~state.given_up & ~(verdict.landed & (state.target == len(problem.targets) - 1)),
+    )
 
 
-class Verdict(NamedTuple):
-    """What to make of an attempt: whether its state is `good` to go on from, or a `saddle` to leave; whether all that
-    may be spent on the target is, and whether the way may be cut."""
-
-    good: jax.Array
-    saddle: jax.Array
-    spent_out: jax.Array
-    may_cut: jax.Array
+# ---------------------------------------------------------------------------------- pieces of a step
 
 
-def _judged(
-    walk: Walk, state: State, counts: jax.Array, budget: jax.Array, sound: jax.Array, solver: Newton
-) -> Verdict:
-    """The verdict on an attempt of at most `budget` steps, by the `counts` of its report."""
-    steps, attempts, status = counts[0], counts[3], counts[-1]
-    converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
-    unstable = (status & Status.UNSTABLE) != 0
-    saddle = converged & unstable & (walk.escapes < (MAX_ESCAPES if solver.escape else 0))
-    spent_out = (steps >= solver.max_steps) | (attempts >= MAX_ATTEMPTS) | ~sound
-    may_cut = (walk.cuts < MAX_CUTS) & (walk.trial > walk.trail.s[0]) & ~spent_out
-    # An inverted state may be a jump too far: it is kept only when smaller steps lead there too.
-    inverted = (status & Status.INVERTED) != 0
-    # So may one that balances with next to no stiffness left, where steps ran out: past a fold a beam creeps by it.
-    creeping = (state.counts[STEPS] >= budget) & (state.correction > INACCURATE)
-    good = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~walk.over
-    return Verdict(good, saddle, spent_out, may_cut)
+def _attempt(problem: Problem, state: Continuation, scene: Scene, max_steps: jax.Array) -> newton.State:
+    """One Newton solve of the scene at the present parameter.
 
-
-def _report(
-    scene: Scene, state: State, spent: jax.Array, judging: jax.Array, sound: jax.Array, solver: Newton
-) -> tuple[jax.Array, jax.Array]:
-    """Numbers, without the last, and counts of one attempt, beside what others at the same target `spent`.
-
-    One that is only `judging` the state of a target given up adds no attempt, and keeps what the last one was flagged.
+    Its probe gives the tangent of the branch. At a saddle it gives a soft mode, to leave it along.
     """
-    converged = (state.residual <= solver.tolerance(state.x.dtype)) & ~judging
-    finite = jnp.isfinite(state.at.energy) & jnp.all(jnp.isfinite(state.at.gradient))
-    volume, element = worst_element(scene, state.x)
-    left = state.correction
-    vague = state.stiffness.marginal | (state.stiffness.definite & ((left > INACCURATE) | state.singular))
+    one = jnp.ones((), state.parameter.dtype)
+    gradient = lambda s, x: jax.grad(energy, argnums=1)(problem.scene_at(s), x)
+    rate = lambda x: jax.jvp(lambda s: gradient(s, x), (state.parameter,), (one,))[1]
+    policy = newton.Policy(
+        max_steps=jnp.where(state.given_up, 0, max_steps),
+        full_steps=jnp.where(state.trail.depth > 0, FULL_STEPS, 0),
+        # Intermediate states of a ramp: all but the last.
+        reuse_factor=state.parameter < problem.targets[-1] if len(problem.targets) > 1 else None,
+        leaving_saddle=state.escapes > 0,
+        # The factor at a saddle filters the soft modes out of noise.
+        probe=lambda x, definite: jnp.where(definite, rate(x), problem.noise),
+    )
+    return newton.newton(scene, problem.layout, state.start, state.displacement, policy, problem.solver)
+
+
+def _report(problem: Problem, state: Continuation, scene: Scene, attempt: newton.State) -> Report:
+    """The report of an attempt, together with the earlier attempts at the same target.
+
+    For a target that is given up, the evaluation at the end is not counted as an attempt, flags of the last attempt
+    are kept, and `reached` tells how much of the way was covered.
+    """
+    spent, counts, given_up = state.spent, attempt.counts, state.given_up
+    volume, element = worst_element(scene, attempt.x)
+    target, covered = problem.targets[state.target], state.trail.s[0]
+    last_flags = jnp.where(given_up, spent.status & (Status.NONFINITE | Status.INVALID), 0)
+    return Report(
+        x=attempt.x,
+        energy=attempt.evaluation.energy,
+        residual=attempt.residual,
+        correction=attempt.correction,
+        smallest_jacobian=volume,
+        reached=jnp.where(given_up, covered / jnp.where(target > 0, target, 1), 1),
+        steps=spent.steps + counts.steps,
+        projected=spent.projected + counts.projected,
+        halvings=spent.halvings + counts.halvings,
+        attempts=spent.attempts + jnp.where(given_up, 0, 1),
+        worst_element=element,
+        status=_flags(problem, state, attempt, volume) | last_flags,
+    )
+
+
+def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume: jax.Array) -> jax.Array:
+    """Status flags `()` of an attempt, or-ed; `volume` `()` is the smallest `J`."""
+    converged = (attempt.residual <= problem.solver.tolerance(attempt.x.dtype)) & ~state.given_up
+    finite = jnp.isfinite(attempt.evaluation.energy) & jnp.all(jnp.isfinite(attempt.evaluation.gradient))
+    definite, marginal = attempt.stiffness.definite, attempt.stiffness.marginal
+    inaccurate = marginal | (definite & ((attempt.correction > INACCURATE) | attempt.singular))
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
+        # True for NaN.
         Status.INVERTED: ~(volume > 0),
-        Status.UNSTABLE: converged & ~state.stiffness.definite & ~state.stiffness.marginal,
-        Status.INACCURATE: converged & vague,
-        Status.INVALID: ~sound,
+        Status.UNSTABLE: converged & ~definite & ~marginal,
+        Status.INACCURATE: converged & inaccurate,
+        Status.INVALID: ~problem.valid[state.target],
     }
-    flags, up = jnp.array([int(flag) for flag in raised], jnp.int32), jnp.stack(list(raised.values()))
-    blame = jnp.where(judging, spent[-1] & (Status.NONFINITE | Status.INVALID), 0)
-    status = jnp.sum(jnp.where(up, flags, 0), dtype=jnp.int32) | blame
-    own = [state.counts[STEPS], state.counts[PROJECTED], state.counts[HALVINGS], jnp.where(judging, 0, 1)]
-    done = jnp.stack(own, dtype=jnp.int32)
-    numbers = jnp.stack([state.at.energy, state.residual, left, volume])
-    return numbers, jnp.concatenate([spent[:4] + done, jnp.stack([element, status], dtype=jnp.int32)])
+    flags, are_raised = jnp.array([int(flag) for flag in raised], jnp.int32), jnp.stack(list(raised.values()))
+    return jnp.sum(jnp.where(are_raised, flags, 0), dtype=jnp.int32)
 
 
-def _solutions(path: Report, ratios: jax.Array, crossed: jax.Array, solver: Newton) -> Solution:
-    """The solutions, with leading axis, of a path of reports, with the edges `(S, 2, 2)` that cross in each."""
-    tolerance = jnp.full(len(ratios), solver.tolerance(path.x.dtype), path.x.dtype)
-    numbers = {name: path.numbers[:, k] for k, name in enumerate(NUMBERS)}
-    counts = {name: path.counts[:, k] for k, name in enumerate(COUNTS)}
-    counts["status"] |= jnp.where(crossed[:, 0, 0] >= 0, int(Status.OVERLAPPING), 0).astype(jnp.int32)
-    return Solution(x=path.x, tolerance=tolerance, crossing=crossed, ratios=ratios, **numbers, **counts)
+def _judge(
+    problem: Problem, state: Continuation, attempt: newton.State, report: Report, max_steps: jax.Array
+) -> Verdict:
+    """The verdict on an attempt of at most `max_steps` `()` steps."""
+    solver, status = problem.solver, report.status
+    converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
+    unstable = (status & Status.UNSTABLE) != 0
+    saddle = converged & unstable & (state.escapes < (MAX_ESCAPES if solver.escape else 0))
+    used_up = (report.steps >= solver.max_steps) | (report.attempts >= MAX_ATTEMPTS) | ~problem.valid[state.target]
+    may_cut = (state.cuts < MAX_CUTS) & (state.parameter > state.trail.s[0]) & ~used_up
+    # The increment may have been too long for an inverted state: it is accepted only where shorter ones lead there too.
+    inverted = (status & Status.INVERTED) != 0
+    # Likewise for a state that balances with almost no stiffness left when its steps are used up: past a fold, Newton's
+    # method creeps by such states.
+    creeping = (attempt.counts.steps >= max_steps) & (attempt.correction > INACCURATE)
+    accepted = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~state.given_up
+    landed = accepted & (state.parameter == problem.targets[state.target])
+    failed = ~accepted & ~saddle
+    return Verdict(accepted, landed, saddle, failed, (~landed & used_up) | (failed & ~may_cut))
+
+
+def _extend(state: Continuation, attempt: newton.State, verdict: Verdict) -> Trail:
+    """The trail, with the state of an accepted attempt.
+
+    The last Newton step, which was computed but not taken, is added to its positions. It doubles the number of correct
+    digits, and the polynomial of the predictor does not amplify what is left unbalanced.
+    """
+    known = attempt.stiffness.definite & jnp.all(jnp.isfinite(attempt.response))
+    corrected = attempt.x + jnp.where(known & (attempt.correction <= INACCURATE), attempt.step, 0)
+    longer = extend(state.trail, state.parameter, corrected, attempt.response, state.displacement, known)
+    return choose(verdict.accepted, longer, state.trail)
+
+
+def _next_parameter(
+    problem: Problem, state: Continuation, verdict: Verdict, report: Report, trail: Trail
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The index of the next target, the parameter of the next attempt, and the increment; each `()`."""
+    cut = jnp.where(verdict.saddle, state.increment, 0.5 * (state.parameter - trail.s[0]))
+    # After a target that was reached at once, the next one is tried at once.
+    easy = verdict.landed & ((report.attempts == 1) | (state.increment <= 0))
+    increment = jnp.where(easy, 1.0, jnp.where(verdict.accepted, 2 * state.increment, cut)).astype(trail.x.dtype)
+    target = jnp.minimum(state.target + verdict.landed.astype(jnp.int32), len(problem.targets) - 1)
+    # An attempt just short of the target would leave an increment of almost nothing.
+    to_target = verdict.give_up | (trail.s[0] + 1.01 * increment >= problem.targets[target])
+    parameter = jnp.where(to_target, problem.targets[target], trail.s[0] + increment)
+    leave = verdict.saddle & ~verdict.give_up
+    return target, jnp.where(leave, state.parameter, parameter), increment
+
+
+def _next_start(
+    state: Continuation,
+    scene: Scene,
+    attempt: newton.State,
+    verdict: Verdict,
+    trail: Trail,
+    accepted: jax.Array,
+    parameter: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Positions `(n, d)` that the next attempt, at `parameter`, starts from, and the displacement added to these."""
+    leave = verdict.saddle & ~verdict.give_up
+    start = jnp.where(leave, attempt.x, jnp.where(verdict.give_up, accepted, trail.x[0]))
+    scale = ESCAPE * extent(scene) / jnp.max(jnp.abs(attempt.response))
+    escape = jnp.where(jnp.isfinite(scale), scale * attempt.response, 0)
+    predicted = jnp.where(verdict.give_up, 0, ahead(trail, parameter))
+    return start, jnp.where(leave, escape, predicted)
+
+
+def _write(state: Continuation, report: Report, final: jax.Array) -> PackedReport:
+    """The path, with the report of the present target if that is `final`."""
+    write = lambda all, new: all.at[state.target].set(jnp.where(final, new, all[state.target]))
+    return jax.tree.map(write, state.path, pack(report))
+
+
+def _solutions(problem: Problem, state: Continuation) -> Solution:
+    """The solutions at all targets, with leading axis `S`, from the final state of a continuation."""
+    scene_at, targets = problem.scene_at, problem.targets
+    # Targets after one that was given up are given up in the same state.
+    row = jnp.minimum(jnp.arange(len(targets), dtype=jnp.int32), state.target)
+    path = jax.tree.map(lambda all: all[row], state.path)
+    ratios = jax.vmap(lambda s: commands_of(scene_at(s)))(targets)
+    crossings = lax.map(lambda x: crossing(scene_at(targets[0]), x), path.x)
+    fields = unpack(path)._asdict()
+    fields["status"] |= jnp.where(crossings[:, 0, 0] >= 0, int(Status.OVERLAPPING), 0).astype(jnp.int32)
+    tolerance = jnp.full(len(ratios), problem.solver.tolerance(path.x.dtype), path.x.dtype)
+    return Solution(tolerance=tolerance, crossing=crossings, ratios=ratios, **fields)

@@ -1,16 +1,16 @@
-"""The derivative through equilibrium: how a solution moves when the scene changes.
+"""The derivative of an equilibrium with respect to the scene, by the implicit function theorem.
 
 At equilibrium the unbalanced forces vanish, `g(scene, x) = 0` on the free coordinates, so
 
-    K dx = -dg        K = dg/dx, the true (unprojected) tangent stiffness,
+    K dx = -dg        K = dg/dx, the true (unprojected) tangent stiffness.
 
-by the implicit function theorem: one back-substitution with a factor of `K`. The solve itself is not
-differentiated, and where it started does not matter. Both sides of the equation are written as functions of the
-scene and of `x`, so JAX can differentiate them again: forward, reverse and to any order.
+This takes one back-substitution with a factor of `K`. The iterations of the solver are not differentiated, and the
+derivative does not depend on where they started. Both sides of the equation are functions of the scene and of `x`, so
+JAX can differentiate them again: forward, reverse and to any order.
 
-The derivative exists where `K` is not singular, which a stable solution guarantees and a fold denies. Where the
-status of the solution is not `OK` it is NaN: not zero, which would pass for an answer. A member of a batch that
-the loss does not look at (its cotangent is exactly zero) harms no other.
+The derivative exists where `K` is not singular: at every stable solution, but not at a fold. Where the status of the
+solution is not `OK` it is NaN; zero could be mistaken for an answer. A failed member of a batch does not affect the
+others as long as the loss does not depend on it (its cotangent is exactly zero).
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ Gradient = Callable[[Scene, jax.Array], jax.Array]
 
 @lru_cache(maxsize=32)
 def _solve(linear: LinearSolver) -> Callable[[Layout, Any, jax.Array], jax.Array]:
-    """`linear.solve` that stays fast under `vmap`: right-hand sides of one factor become the columns of one, and those
-    of many factors are solved in turn, for batched triangular solves are slow."""
+    """`linear.solve` with its own rule for `vmap`.
+
+    Right-hand sides of one factor become columns of one solve. Those of many factors are solved one after the other,
+    because batched triangular solves are slow.
+    """
     solve = jax.custom_batching.custom_vmap(linear.solve)
 
     @solve.def_vmap
@@ -51,7 +54,7 @@ energy_gradient = jax.grad(energy, argnums=1)
 
 
 def linear_gradient(scene: Scene, x: jax.Array) -> jax.Array:
-    """Gradient `(n, 2)` at `x` of the energy expanded to second order about rest."""
+    """Gradient `(n, d)` at `x` of the energy expanded to second order about rest."""
     rest = scene.mesh.nodes
     force, change = jax.jvp(partial(energy_gradient, scene), (rest,), (x - rest,))
     return force + change
@@ -60,15 +63,15 @@ def linear_gradient(scene: Scene, x: jax.Array) -> jax.Array:
 def follow_scene(
     linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
 ) -> jax.Array:
-    """`x` `(n, 2)` itself, which moves with the scene as its equilibrium does.
+    """`x` itself, with the derivative of the equilibrium attached.
 
     Args:
         linear: the linear solver.
         scene: with unlocked indices; differentiable in all its floats.
         layout: of its matrix.
-        x: an equilibrium of the scene. Its own tangent is ignored.
-        factor: of the true stiffness at `x`; None to make one if it is asked for.
-        trusted: `()` whether `x` is an equilibrium with a definite stiffness.
+        x: `(n, d)` an equilibrium of the scene. A tangent of `x` itself is ignored.
+        factor: of the true stiffness at `x`; None to factorise it when a derivative is asked for.
+        trusted: `()` whether `x` is an equilibrium with a positive definite stiffness. If not, the derivative is NaN.
     """
     return follow_zero(linear, energy_gradient, scene, layout, x, factor, trusted)
 
@@ -83,10 +86,16 @@ def follow_zero(
     factor: Any,
     trusted: jax.Array,
 ) -> jax.Array:
-    """`x` `(n, 2)` itself, which moves with the scene so that `gradient(scene, x)` stays zero where it is free.
+    """`x` itself, with the derivative that keeps `gradient(scene, x)` zero on free coordinates.
 
-    `gradient` is `energy_gradient` or `linear_gradient`; otherwise as `follow_scene`. `factor` is that of its
-    derivative by `x`, and None only for the first.
+    Args:
+        linear: the linear solver.
+        gradient: `energy_gradient` or `linear_gradient`.
+        scene: as of `follow_scene`.
+        layout: as of `follow_scene`.
+        x: `(n, d)` positions at which the gradient is zero on free coordinates.
+        factor: of the derivative of `gradient` in `x`. None is allowed with `energy_gradient` only.
+        trusted: as of `follow_scene`.
     """
     return x
 
@@ -98,22 +107,22 @@ def _follow_zero_jvp(
     scene, layout, found, factor, trusted = primals
     scene_dot = tangents[0]
     x = follow_zero(linear, gradient, *primals)
-    # The slope of a bad solution is NaN: kept out of second derivatives that do not look at it.
+    # The derivative of a failed solution is NaN. Keep it out of second derivatives that do not depend on it.
     at = jnp.where(trusted, x, found)
     if factor is None:
         factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(*lax.stop_gradient((scene, found)))))
     factor = lax.stop_gradient(factor)
 
     def product(v: jax.Array) -> jax.Array:
-        """The stiffness times a vector of unknowns."""
+        """The stiffness times a vector of unknowns `(N,)`."""
         return gather(layout, jax.jvp(lambda y: gradient(scene, y), (at,), (expand(layout, v, x.shape),))[1])
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
         y = _solve(linear)(layout, factor, b)
         return jnp.where(trusted, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(y.dtype))
 
-    # Fixed coordinates are at rest, and move with the rest positions.
-    carried = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
-    pull = jax.jvp(gradient, (scene, at), (scene_dot, carried))[1]
-    moved = lax.custom_linear_solve(product, -gather(layout, pull), solve, symmetric=True)
-    return x, expand(layout, moved, x.shape) + carried
+    # Fixed coordinates stay at rest: they move with the rest positions.
+    fixed_dot = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
+    gradient_dot = jax.jvp(gradient, (scene, at), (scene_dot, fixed_dot))[1]
+    free_dot = lax.custom_linear_solve(product, -gather(layout, gradient_dot), solve, symmetric=True)
+    return x, expand(layout, free_dot, x.shape) + fixed_dot

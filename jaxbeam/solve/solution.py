@@ -1,4 +1,4 @@
-"""What a solve answers, and how far the answer can be trusted."""
+"""The result of a solve, with flags and figures that tell how far to trust it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,17 @@ from jaxbeam.core.tree import is_concrete, pytree
 
 
 class Status(enum.IntFlag):
-    """What is wrong with an answer; `OK` is zero. Flags combine."""
+    """What is wrong with a solution, as flags that combine; see `REMEDIES` for what to do.
+
+    OK: nothing.
+    NOT_CONVERGED: no equilibrium was found.
+    NONFINITE: energy or forces are not finite.
+    INVERTED: an element has `J <= 0`.
+    UNSTABLE: the equilibrium is a saddle.
+    INVALID: a parameter of the scene is out of its range.
+    INACCURATE: round-off leaves positions or stability uncertain.
+    OVERLAPPING: the body passes through itself.
+    """
 
     OK = 0
     NOT_CONVERGED = 1
@@ -25,18 +35,18 @@ class Status(enum.IntFlag):
 
 
 REMEDIES = {
-    Status.NOT_CONVERGED: "no equilibrium was reached: approach the command by ramp(scene, ratios, steps) with more "
-    "steps, raise Newton.max_steps, or command less; x is the last state that was in balance, not the answer",
+    Status.NOT_CONVERGED: "no equilibrium was found, and x is the last state that was in balance, not the answer: "
+    "approach the command by ramp(scene, ratios, steps) with more steps, raise Newton.max_steps, or command less",
     Status.NONFINITE: "energy or forces are not finite: check parameters and x0, which must not invert an element "
     "of a logarithmic material",
     Status.INVERTED: "an element is turned inside out (J <= 0): command less, approach it by ramp, use a finer mesh "
     "or a material that resists it, such as neo_hookean",
     Status.UNSTABLE: "the equilibrium is a saddle, which a real beam leaves: set Newton(escape=True), or start from "
     "x0 = x + a little of lowest_mode(scene, x)",
-    Status.INACCURATE: "forces balance to round-off, but that leaves positions uncertain by more than a thousandth of "
-    "the body (see correction), or whether the equilibrium is stable: use float64; in float64 the command is at a "
-    "limit of stability, such as a fold, where no derivative exists: see lowest_mode",
-    Status.OVERLAPPING: "the body passes through itself, and nothing here models that contact: two edges of its "
+    Status.INACCURATE: "forces balance to round-off, but positions are still uncertain by more than a thousandth of "
+    "the body (see correction), or it is unknown whether the equilibrium is stable: use float64; in float64 the "
+    "command is at a limit of stability, such as a fold, where no derivative exists: see lowest_mode",
+    Status.OVERLAPPING: "the body passes through itself, because contact is not modelled: two edges of its "
     "surface cross (see crossing); command less, or start from another state",
     Status.INVALID: "a parameter is out of its range (ratios and moduli must be positive, Poisson's ratio in "
     "(-1, 0.5), all finite): build the scene outside jit to be told which",
@@ -44,29 +54,29 @@ REMEDIES = {
 
 
 class EquilibriumError(RuntimeError):
-    """Raised by `check` for a solution that cannot be trusted; says what is wrong and what to try."""
+    """Raised by `check` for a solution that cannot be trusted. It says what is wrong and what to try."""
 
 
 @pytree
 class Solution:
-    """An equilibrium and how far to trust it. `ramp` and `sweep` return one with a leading axis.
+    """An equilibrium, and how far to trust it. `ramp` and `sweep` return one with a leading axis.
 
     x: `(n, 2)` node positions.
     energy: `()` total energy.
     residual: `()` largest unbalanced force on a free coordinate, over the force scale.
-    tolerance: `()` what the residual had to reach.
-    correction: `()` what one more Newton step would move a node, over the size of the body: how far round-off leaves
-        `x` from the equilibrium, along its softest directions.
+    tolerance: `()` the residual that had to be reached.
+    correction: `()` the most that one further Newton step would move a node, over the size of the body: how far
+        round-off leaves `x` from the equilibrium, along its softest directions.
     steps: `()` Newton steps taken, all attempts together.
-    projected: `()` how many of them used projected Hessians.
-    halvings: `()` line-search halvings in all.
-    attempts: `()` Newton solves; more than 1 when a first one failed or ended on a saddle.
+    projected: `()` how many of them used a modified Hessian.
+    halvings: `()` halvings of the line search, all steps together.
+    attempts: `()` Newton solves; more than 1 when the first failed or ended on a saddle.
     smallest_jacobian: `()` smallest `J = det F` anywhere in the solids; infinite without one.
-    worst_element: `()` the element where it is.
+    worst_element: `()` number of the element where it is smallest.
     crossing: `(2, 2)` int32, two edges of the surface that cross, each by the numbers of its end nodes; -1 if none do.
     ratios: `(m,)` commanded ratio of each tendon.
-    reached: `()` how far `x` got: 1 at the command itself; less where the way to it broke off, and then `x`
-        is the equilibrium at that fraction of the way.
+    reached: `()` 1 at the command itself. Less if the way to it broke off: then `x` is the equilibrium at that fraction
+        of the way.
     status: `()` int32 of or-ed `Status` flags; 0 is `OK`.
     """
 
@@ -88,12 +98,15 @@ class Solution:
 
 
 def check(solution: Solution) -> Solution:
-    """The solution itself if its status is `OK` throughout.
+    """Return the solution if its status is `OK`, in every member of a batch.
+
+    Args:
+        solution: from `equilibrium`, `ramp` or `sweep`.
 
     Raises:
-        EquilibriumError: otherwise. Says which flags, which members of a batch, residual against
-            tolerance, steps, smallest `J` and where, the command, and what to try.
-        ValueError: if the solution is traced: statuses have no value inside jit.
+        EquilibriumError: otherwise. It names the flags and the members of the batch that raise them, residual and
+            tolerance, steps, smallest `J` and its element, the command, and what to try.
+        ValueError: if the solution is traced: a status has no value inside jit.
     """
     checks.instance("solution", solution, Solution, "give what equilibrium, ramp or sweep returned")
     if not is_concrete(solution.status):
@@ -115,7 +128,7 @@ def check(solution: Solution) -> Solution:
 
 
 def _describe(solution: Solution, member: int) -> str:
-    """The figures of one member of a batch, for an error's text."""
+    """The figures of one member of a batch, for the text of an error."""
 
     def of(field: jax.Array, rank: int = 0) -> np.ndarray:
         array = np.asarray(field)

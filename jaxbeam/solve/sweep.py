@@ -1,12 +1,12 @@
 """Many commands at once.
 
-A sweep repeats work: neighbours differ by little. So each command is continued from the nearest one solved already, as
-far as their tangents lead (`jaxbeam.solve.predictor`), and one or two Newton steps are left to take where a solve from
-rest takes ten or twenty.
+Neighbouring commands have similar equilibria. So each command is continued from the nearest one that is solved already,
+with its tangent as predictor (`jaxbeam.solve.predictor`). This takes one or two Newton steps, where a solve from rest
+takes ten or twenty.
 
-Commands are parted into chunks of near ones, by a rule that depends on nothing but the commands and the scene. A chunk
-is one call of one compiled program, whatever their number, which goes through its commands from rest outward. Chunks
-know nothing of each other: they run on all cores, devices and processes there are, in any order, with the same results.
+Commands are divided into chunks of near ones, by a rule that depends on the commands and the scene alone. One compiled
+program solves a chunk of any number of commands, from rest outward. Chunks are independent: they run on all cores,
+devices and processes, in any order, with the same results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jax import lax
 from jax.sharding import PartitionSpec
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import blank, compiled, usual_rules
+from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
 from jaxbeam.scene.scene import Scene, command, energy, partway
@@ -35,19 +35,20 @@ from jaxbeam.solve.newton import Newton, check_asked, topology
 from jaxbeam.solve.predictor import STATES, Trail, ahead
 from jaxbeam.solve.solution import Solution, Status
 
-# Commands of a chunk, and the numbers that its states and tangents may take (half a gigabyte).
+# The most commands in a chunk.
 CHUNK = 128
 
 
+# The most numbers in the positions and tangents of a chunk: half a gigabyte in float64.
 MEMORY = 1 << 26
 
 
-# How far apart (in ratios) the states are, at least, that a prediction is made from: a polynomial through nearer ones
-# blows up their round-off, and that costs a Newton step.
+# The least distance (in ratios) between states that a prediction is made from. A polynomial through nearer ones
+# amplifies their round-off, and that costs a Newton step.
 GAP = 0.005
 
 
-# Square of the sine of the angle within which two directions are one.
+# Two directions count as one if the square of the sine of the angle between them is below this.
 STRAIGHT = 1e-12
 
 
@@ -60,22 +61,22 @@ def sweep(
 ) -> Solution:
     """The equilibrium of each of many commands.
 
-    Each is continued from the nearest of those nearer to rest that are solved already, and solved from rest where that
-    fails. Where a command has several equilibria it is the one that a beam comes to whose tendons are pulled ever more;
-    `ramp` follows a way of your own. One that fails harms no other.
+    Each command is continued from the nearest one that is closer to rest and solved already; if that fails, it is
+    solved from rest. Where a command has several equilibria, this finds the one that a beam reaches when its tendons
+    are shortened monotonically; `ramp` follows a path of your own. A command that fails does not affect the others.
 
-    It runs on all cores of all local devices. Where `jax.distributed` is set up every process calls it with the same
-    arguments, solves a part, and gets the whole; the results do not depend on how many there are.
+    It runs on all cores of all local devices. Under `jax.distributed` every process calls it with the same arguments,
+    solves a part of the commands, and gets all results. These do not depend on the number of processes.
 
     Args:
         scene: with `m` tendons.
         ratios: `(B, m)`, positive.
         solver: settings of each solve.
-        progress: called with how many of this process's commands are solved and how many there are, whenever there are
-            more. Not called inside jit.
+        progress: called as `progress(solved, all)` after each chunk, with numbers of this process's commands. Not
+            called inside jit.
 
     Returns:
-        A `Solution` with leading axis `B`, differentiable as that of `equilibrium` is, lane by lane.
+        A `Solution` with leading axis `B`. Each command's is differentiable as that of `equilibrium` is.
 
     Raises:
         ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
@@ -85,7 +86,7 @@ def sweep(
     shape = values.shape
     if len(shape) != 2 or shape[0] == 0:
         raise ValueError(f"ratios: expected shape (B, m), a row for each command, got {shape}")
-    # `is_valid` looks at traced ones.
+    # Traced ratios are checked by `is_valid`, and flagged.
     if is_concrete(values):
         checks.inside("ratios", values, checks.POSITIVE)
     if progress is not None:
@@ -96,7 +97,7 @@ def sweep(
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     size = min(CHUNK, max(1, MEMORY // (scene.mesh.nodes.size * (1 + shape[1]))))
     if is_concrete(rows, *jax.tree.leaves(scene)):
-        return _everywhere(open_scene, layout, np.asarray(rows), size, solver, progress)
+        return _on_all_cores(open_scene, layout, np.asarray(rows), size, solver, progress)
     batch = _in_one_program(*lax.stop_gradient((open_scene, layout, rows)), min(size, shape[0]), solver)
     return differentiable_rows(open_scene, layout, rows, batch, solver)
 
@@ -105,121 +106,170 @@ def sweep(
 
 
 class Chunk(NamedTuple):
-    """What is known in a chunk of `C` commands. The last of the `C + 1` places is the beam at rest."""
+    """What is known of a chunk of `C` commands: one entry each, and a last one, with index `C`, for the beam at rest.
 
-    ratios: jax.Array  # (C + 1, m)
-    loaded: jax.Array  # (C + 1,) share of the dead loads: 0 at rest
-    x: jax.Array  # (C + 1, n, 2) where the branch lies, closer than the solution (see `follow`)
-    drift: jax.Array  # (C + 1, m, n, 2) derivative of x in each ratio
-    usable: jax.Array  # (C + 1,) may be continued from
-    known: jax.Array  # (C + 1,) its drift is known
-    anchor: jax.Array  # (C + 1,) the place farther back on its smooth branch that is remembered; C if there is none
+    ratios: `(C + 1, m)` commands.
+    loaded: `(C + 1,)` share of the dead loads: 0 at rest, 1 elsewhere.
+    x: `(C + 1, n, d)` positions, with the last correction added (see `Continuation.trail`).
+    tangent: `(C + 1, m, n, d)` derivative of the positions in each ratio.
+    usable: `(C + 1,)` whether others may be continued from it.
+    known: `(C + 1,)` whether its tangent is known.
+    previous: `(C + 1,)` index of an entry closer to rest on the same smooth branch; `C` if there is none.
+    """
 
-
-@compiled("solver")
-def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array, solver: Newton) -> Solution:
-    """The equilibria of the first `count` of the commands `rows` `(C, m)`, from rest outward."""
-    size, m = rows.shape
-    rest = scene.mesh.nodes
-    order = jnp.argsort(jnp.sum((rows - 1) ** 2, axis=1) + jnp.where(jnp.arange(size) < count, 0, jnp.inf))
-    no, places = jnp.zeros(size + 1, bool), jnp.zeros((size + 1, *rest.shape), rest.dtype)
-    chunk = Chunk(
-        ratios=jnp.concatenate([rows, jnp.ones((1, m), rows.dtype)]),
-        loaded=jnp.ones(size + 1, rest.dtype).at[-1].set(0),
-        x=places.at[-1].set(rest),
-        drift=jnp.zeros((size + 1, m, *rest.shape), rest.dtype),
-        usable=no.at[-1].set(True),
-        known=no,
-        anchor=jnp.full(size + 1, size, jnp.int32),
-    )
-    nothing = blank(lambda: _continue(scene, layout, chunk, order[0], chunk.anchor[0], solver))
-
-    def one(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
-        chunk, all = carry
-        lane = order[k]
-        nearest = _nearest(chunk, rows[lane])
-
-        def attempt(carry: Any) -> Any:
-            parent, _, _ = carry
-            found = _continue(scene, layout, chunk, lane, parent, solver)
-            # One that fails is begun again at rest.
-            again = ((found.solution.status & ~Status.OVERLAPPING) != 0) & (parent != size)
-            return jnp.where(again, size, parent), again, found
-
-        begin = (nearest, jnp.asarray(True), nothing)
-        parent, _, found = lax.while_loop(lambda c: c[1], attempt, begin)
-        # A body that overlaps itself is an equilibrium to go on from.
-        good = (found.solution.status & ~Status.OVERLAPPING) == 0
-        back = chunk.anchor[parent]
-        near = chunk.known[back] & (jnp.sum((chunk.ratios[parent] - chunk.ratios[back]) ** 2) < GAP**2)
-        anchor = jnp.where(found.joined, jnp.where(near, back, parent), size)
-        chunk = chunk._replace(
-            x=chunk.x.at[lane].set(found.x),
-            drift=chunk.drift.at[lane].set(found.drift),
-            usable=chunk.usable.at[lane].set(good),
-            known=chunk.known.at[lane].set(good & found.known),
-            anchor=chunk.anchor.at[lane].set(anchor),
-        )
-        return chunk, jax.tree.map(lambda many, new: many.at[lane].set(new), all, found.solution)
-
-    none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), nothing.solution)
-    return lax.fori_loop(0, count, one, (chunk, none))[1]
+    ratios: jax.Array
+    loaded: jax.Array
+    x: jax.Array
+    tangent: jax.Array
+    usable: jax.Array
+    known: jax.Array
+    previous: jax.Array
 
 
-class Lane(NamedTuple):
-    """What comes of one command: its solution, the branch and its drift there, whether that is known, and joined to its
-    parent."""
+class Continued(NamedTuple):
+    """What is found for one command.
+
+    solution: its solution.
+    x: `(n, d)` positions, with the last correction added.
+    tangent: `(m, n, d)` derivative of the positions in each ratio.
+    known: `()` whether the tangent is known.
+    joined: `()` whether it lies on the same smooth branch as the entry it was continued from.
+    """
 
     solution: Solution
     x: jax.Array
-    drift: jax.Array
+    tangent: jax.Array
     known: jax.Array
     joined: jax.Array
 
 
-def _continue(scene: Scene, layout: Layout, chunk: Chunk, lane: jax.Array, parent: jax.Array, solver: Newton) -> Lane:
-    """The equilibrium of a lane, continued from that of its parent."""
-    ratios, here = chunk.ratios[lane], chunk.ratios[parent]
+@compiled("solver")
+def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array, solver: Newton) -> Solution:
+    """The equilibria of the commands of a chunk, solved from rest outward.
+
+    Args:
+        scene: with `m` tendons and unlocked indices.
+        layout: of its matrix.
+        rows: `(C, m)` commands.
+        count: `()` how many of them, from the first on, are solved.
+        solver: settings.
+
+    Returns:
+        The solutions, with leading axis `C`; zeros after the first `count`.
+    """
+    size = len(rows)
+    order = jnp.argsort(jnp.sum((rows - 1) ** 2, axis=1) + jnp.where(jnp.arange(size) < count, 0, jnp.inf))
+    chunk = _at_rest(scene, rows)
+    zeros = zeros_like_result(lambda: _continue(scene, layout, chunk, order[0], chunk.previous[0], solver))
+
+    def solve_next(k: jax.Array, carry: tuple[Chunk, Solution]) -> tuple[Chunk, Solution]:
+        chunk, solutions = carry
+        index = order[k]
+
+        def attempt(carry: Any) -> Any:
+            parent, _, _ = carry
+            found = _continue(scene, layout, chunk, index, parent, solver)
+            # One that fails is tried again from rest.
+            again = ~_is_good(found.solution) & (parent != size)
+            return jnp.where(again, size, parent), again, found
+
+        begin = (_nearest(chunk, rows[index]), jnp.asarray(True), zeros)
+        parent, _, found = lax.while_loop(lambda carry: carry[1], attempt, begin)
+        solutions = jax.tree.map(lambda all, new: all.at[index].set(new), solutions, found.solution)
+        return _entered(chunk, index, parent, found), solutions
+
+    none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), zeros.solution)
+    return lax.fori_loop(0, count, solve_next, (chunk, none))[1]
+
+
+def _at_rest(scene: Scene, rows: jax.Array) -> Chunk:
+    """A chunk of the commands `rows` `(C, m)` of which none is solved: only the entry at rest is usable."""
+    size, m = rows.shape
+    rest = scene.mesh.nodes
+    no, zeros = jnp.zeros(size + 1, bool), jnp.zeros((size + 1, *rest.shape), rest.dtype)
+    return Chunk(
+        ratios=jnp.concatenate([rows, jnp.ones((1, m), rows.dtype)]),
+        loaded=jnp.ones(size + 1, rest.dtype).at[-1].set(0),
+        x=zeros.at[-1].set(rest),
+        tangent=jnp.zeros((size + 1, m, *rest.shape), rest.dtype),
+        usable=no.at[-1].set(True),
+        known=no,
+        previous=jnp.full(size + 1, size, jnp.int32),
+    )
+
+
+def _is_good(solution: Solution) -> jax.Array:
+    """Whether others may be continued from a solution, `()`. A body that overlaps itself is an equilibrium too."""
+    return (solution.status & ~Status.OVERLAPPING) == 0
+
+
+def _entered(chunk: Chunk, index: jax.Array, parent: jax.Array, found: Continued) -> Chunk:
+    """The chunk with what was found for the command with this index, continued from the entry `parent` `()`."""
+    good, size = _is_good(found.solution), len(chunk.ratios) - 1
+    before = chunk.previous[parent]
+    # The parent is skipped if it is too near to the entry before it.
+    near = chunk.known[before] & (jnp.sum((chunk.ratios[parent] - chunk.ratios[before]) ** 2) < GAP**2)
+    previous = jnp.where(found.joined, jnp.where(near, before, parent), size)
+    return chunk._replace(
+        x=chunk.x.at[index].set(found.x),
+        tangent=chunk.tangent.at[index].set(found.tangent),
+        usable=chunk.usable.at[index].set(good),
+        known=chunk.known.at[index].set(good & found.known),
+        previous=chunk.previous.at[index].set(previous),
+    )
+
+
+def _continue(
+    scene: Scene, layout: Layout, chunk: Chunk, index: jax.Array, parent: jax.Array, solver: Newton
+) -> Continued:
+    """The equilibrium of the command with this index, continued from the entry `parent`."""
+    ratios, start = chunk.ratios[index], chunk.ratios[parent]
     loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
-    scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * here + s * ratios)
+    scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * start + s * ratios)
     trail = _trail(chunk, parent, ratios)
     one = jnp.ones((), chunk.x.dtype)
-    path, factor, after = follow(scene_at, layout, trail, one[None], solver, way=ahead(trail, one))
+    path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=ahead(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
-    slope = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
-    pull = lambda e: gather(layout, jax.jvp(slope, (ratios,), (e,))[1])
-    pulls = jax.vmap(pull, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
-    moves = solver.linear.solve(layout, factor, pulls)
-    drift = jax.vmap(lambda v: expand(layout, -v, found.x.shape), in_axes=1)(moves)
-    known = (after.depth > 0) & jnp.all(jnp.isfinite(drift))
-    return Lane(found, after.x[0], drift, known, (after.depth > 1) & (found.attempts == 1))
+    gradient = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
+    load = lambda direction: gather(layout, jax.jvp(gradient, (ratios,), (direction,))[1])
+    loads = jax.vmap(load, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
+    moves = solver.linear.solve(layout, factor, loads)
+    tangent = jax.vmap(lambda move: expand(layout, -move, found.x.shape), in_axes=1)(moves)
+    known = (after.depth > 0) & jnp.all(jnp.isfinite(tangent))
+    return Continued(found, after.x[0], tangent, known, (after.depth > 1) & (found.attempts == 1))
 
 
 def _nearest(chunk: Chunk, ratios: jax.Array) -> jax.Array:
-    """The place to continue from: the nearest, where one that has its anchor right behind it counts as half as far."""
-    ahead, behind = ratios - chunk.ratios, chunk.ratios - chunk.ratios[chunk.anchor]
-    far, along = jnp.sum(ahead**2, axis=1), jnp.sum(ahead * behind, axis=1)
-    straight = chunk.known[chunk.anchor] & (along > 0) & (along**2 >= (1 - STRAIGHT) * far * jnp.sum(behind**2, axis=1))
-    return jnp.argmin(jnp.where(chunk.usable, jnp.where(straight, 0.25, 1.0) * far, jnp.inf)).astype(jnp.int32)
+    """Index `()` of the entry to continue from: the nearest usable one.
+
+    The distance of an entry counts half if its previous one lies on the same line to `ratios` `(m,)`: then the
+    predictor has two states.
+    """
+    onward, back = ratios - chunk.ratios, chunk.ratios - chunk.ratios[chunk.previous]
+    distance, along = jnp.sum(onward**2, axis=1), jnp.sum(onward * back, axis=1)
+    straight = along**2 >= (1 - STRAIGHT) * distance * jnp.sum(back**2, axis=1)
+    straight = chunk.known[chunk.previous] & (along > 0) & straight
+    weighted = jnp.where(straight, 0.25, 1.0) * distance
+    return jnp.argmin(jnp.where(chunk.usable, weighted, jnp.inf)).astype(jnp.int32)
 
 
 def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
-    """The trail from the anchors that lie on the line from the parent on to `ratios`: the parent at `s = 0`."""
+    """The trail of the parent, at `s = 0`, and its previous entries, as long as they lie on the line to `ratios`."""
     direction = ratios - chunk.ratios[parent]
     length = jnp.sum(direction**2)
-    places, s, fits = [parent], [jnp.zeros((), ratios.dtype)], [chunk.known[parent]]
+    entries, s, fits = [parent], [jnp.zeros((), ratios.dtype)], [chunk.known[parent]]
     for _ in range(STATES - 1):
-        place = chunk.anchor[places[-1]]
-        back = chunk.ratios[place] - chunk.ratios[parent]
+        entry = chunk.previous[entries[-1]]
+        back = chunk.ratios[entry] - chunk.ratios[parent]
         along = jnp.sum(back * direction) / jnp.where(length > 0, length, 1)
-        aside = jnp.sum((back - along * direction) ** 2)
-        # Farther back by more than a hair, or the polynomial through both is ill-defined.
+        across = jnp.sum((back - along * direction) ** 2)
+        # Farther back by a hundredth of the step at least, or the polynomial through both is ill-conditioned.
         behind = along < s[-1] - 0.01
-        fits.append(fits[-1] & chunk.known[place] & behind & (aside <= STRAIGHT * length))
-        places.append(place)
+        fits.append(fits[-1] & chunk.known[entry] & behind & (across <= STRAIGHT * length))
+        entries.append(entry)
         s.append(along)
-    where = jnp.stack(places)
-    slopes = jnp.einsum("qmna,m->qna", chunk.drift[where], direction)
+    where = jnp.stack(entries)
+    slopes = jnp.einsum("qmna,m->qna", chunk.tangent[where], direction)
     return Trail(jnp.stack(s), chunk.x[where], slopes, jnp.sum(jnp.stack(fits), dtype=jnp.int32))
 
 
@@ -228,7 +278,7 @@ def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
 
 @partial(jax.jit, static_argnames=("size", "solver"))
 def _in_one_program(scene: Scene, layout: Layout, rows: jax.Array, size: int, solver: Newton) -> Solution:
-    """The equilibria of traced commands `rows` `(B, m)`, in chunks of consecutive ones."""
+    """The equilibria of traced commands `rows` `(B, m)`, in chunks of `size` consecutive ones."""
     count = len(rows)
     chunks = -(-count // size)
     padded = jnp.concatenate([rows, jnp.ones((chunks * size - count, rows.shape[1]), rows.dtype)])
@@ -246,7 +296,7 @@ def _on_devices(
     devices: tuple[jax.Device, ...],
     solver: Newton,
 ) -> Solution:
-    """One chunk on each device: `rows` `(D, C, m)`, of which the first `counts` `(D,)` are solved."""
+    """One chunk on each of `D` devices: commands `rows` `(D, C, m)`, of which the first `counts` `(D,)` are solved."""
     each = PartitionSpec("devices")
     one = lambda scene, layout, rows, counts: jax.tree.map(
         lambda leaf: leaf[None], solve_chunk(scene, layout, rows[0], counts[0], solver)
@@ -256,7 +306,7 @@ def _on_devices(
     return jax.shard_map(one, mesh=mesh, in_specs=specs, out_specs=each, check_vma=False)(scene, layout, rows, counts)
 
 
-def _everywhere(
+def _on_all_cores(
     scene: Scene,
     layout: Layout,
     rows: np.ndarray,
@@ -267,7 +317,7 @@ def _everywhere(
     """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
     parts = _partition(rows, np.arange(len(rows)), size)
     processes, devices = jax.process_count(), tuple(jax.local_devices())
-    # Where there are fewer parts than processes, one that has none solves the first for nothing: all must take part.
+    # All processes must take part: with fewer parts than processes, one that has none solves the first again.
     mine = parts[jax.process_index() :: processes] or parts[:1]
     jobs = [mine[k : k + len(devices)] for k in range(0, len(mine), len(devices))]
 
@@ -279,18 +329,18 @@ def _everywhere(
         return [jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(job))]
 
     results: list[Solution] = []
-    # Devices of a kind share the work by themselves; a processor's cores are one device, and each takes a job.
+    # Several devices solve the chunks of one job together. To JAX the cores of a processor are one device: each gets a
+    # thread, which solves one job after the other.
     workers = (os.cpu_count() or 1) if len(devices) == 1 and devices[0].platform == "cpu" else 1
     if len(jobs) > 1:
-        # Nothing to do, but it compiles: each thread would.
+        # An empty job compiles the program once; otherwise each thread would compile it.
         solve([])
     with ThreadPoolExecutor(workers) as pool:
         for found in pool.map(solve, jobs):
             results += found
             if progress is not None:
                 progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
-    everyone = results if processes == 1 else _gathered(results, len(parts))
-    return _assembled(parts, everyone)
+    return _assembled(parts, results if processes == 1 else _gathered(results, len(parts)))
 
 
 def _gathered(mine: list[Solution], count: int) -> list[Solution]:
@@ -299,14 +349,14 @@ def _gathered(mine: list[Solution], count: int) -> list[Solution]:
 
     processes = jax.process_count()
     most = -(-count // processes)
-    # Every process must bring as many; what is too much is not looked at.
+    # Every process must contribute the same number; the surplus is ignored.
     padded = mine + [mine[-1]] * (most - len(mine))
     everyone = multihost_utils.process_allgather(jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
     return [jax.tree.map(lambda leaf, k=k: leaf[k % processes, k // processes], everyone) for k in range(count)]
 
 
 def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
-    """The solutions of all parts, in the order in which the commands were given."""
+    """The solutions of all parts, in the order of the commands that were passed."""
     order = np.argsort(np.concatenate(parts))
     join = lambda *leaves: to_device(
         np.concatenate([leaf[: len(part)] for leaf, part in zip(leaves, parts, strict=True)])[order]
@@ -314,11 +364,17 @@ def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
     return jax.tree.map(join, *results)
 
 
-def _partition(rows: np.ndarray, lanes: np.ndarray, size: int) -> list[np.ndarray]:
-    """Lanes in groups of at most `size`, near to each other: the widest coordinate is halved until they fit."""
-    if len(lanes) <= size:
-        return [lanes]
-    axis = np.argmax(np.ptp(rows[lanes], axis=0))
-    ordered = lanes[np.argsort(rows[lanes, axis], kind="stable")]
-    middle = -(-len(lanes) // (2 * size)) * size
+def _partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndarray]:
+    """Divide commands into groups of at most `size` near ones, by halving the widest coordinate until they fit.
+
+    Args:
+        rows: `(B, m)` commands.
+        indices: of those to divide.
+        size: the most in a group.
+    """
+    if len(indices) <= size:
+        return [indices]
+    axis = np.argmax(np.ptp(rows[indices], axis=0))
+    ordered = indices[np.argsort(rows[indices, axis], kind="stable")]
+    middle = -(-len(indices) // (2 * size)) * size
     return _partition(rows, ordered[:middle], size) + _partition(rows, ordered[middle:], size)

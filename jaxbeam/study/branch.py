@@ -25,7 +25,8 @@ from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_asked, force_round_off, relative_residual, row_magnitudes, topology
+from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.residual import force_round_off, relative_residual, row_magnitudes
 from jaxbeam.solve.solution import Status, check
 from jaxbeam.study.stability import lowest_mode
 

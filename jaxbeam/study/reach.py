@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import blank, choose, usual_rules
+from jaxbeam.core.compiling import choose, usual_rules, zeros_like_result
 from jaxbeam.core.tree import Numbers, is_concrete, replace
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene, command_count
@@ -180,7 +180,7 @@ def _reach(
     def from_start(theta: jax.Array) -> Design:
         # What cannot be reached is searched once more from there, approached from rest: the search may have come
         # to it by way of a state that a beam pulled straight to it does not take.
-        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, blank(once, theta)))[2]
+        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, zeros_like_result(once, theta)))[2]
 
     found = lax.map(from_start, begin)
     # The nearest; among those that reach the target the one of least effort.

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxbeam.core.compiling import blank, choose, compiled
+from jaxbeam.core.compiling import choose, compiled, zeros_like_result
 from jaxbeam.core.tree import pytree, replace, unlock
 from jaxbeam.linear.layout import Layout
 from jaxbeam.scene.scene import Scene, command
@@ -170,7 +170,7 @@ def search(
         )
 
     zeros = lambda *shape: jnp.zeros(shape, dtype)
-    nothing = blank(
+    nothing = zeros_like_result(
         lambda: approach(unlock(problem.scene), problem.layout, theta, theta, x, zeros(*x.shape), solver)[0]
     )
     begin = Stand(

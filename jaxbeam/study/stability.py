@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import blank, usual_rules
+from jaxbeam.core.compiling import usual_rules, zeros_like_result
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, is_concrete, pytree, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand
@@ -144,7 +144,7 @@ def lowest_pairs(layout: Layout, storage: jax.Array, count: int, linear: LinearS
         factor, done = linear.factor(layout, storage.at[layout.diagonal].add(shift))
         return tries + 1, shift, factor, done
 
-    no_factor = blank(linear.factor, layout, storage)[0]
+    no_factor = zeros_like_result(linear.factor, layout, storage)[0]
     start = (jnp.zeros((), jnp.int32), jnp.zeros((), storage.dtype), no_factor, jnp.asarray(False))
     _, shift, factor, _ = lax.while_loop(lambda c: ~c[3] & (c[0] < 80), grow, start)
     solve = jax.vmap(lambda column: linear.solve(layout, factor, column), in_axes=1, out_axes=1)

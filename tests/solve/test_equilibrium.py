@@ -9,7 +9,8 @@ from helpers import PAIR_NODES, affine, forces, macneal_harder, reactions, small
 import jaxbeam as jb
 from jaxbeam.core.tree import unlock
 from jaxbeam.scene.scene import stencil_hessians
-from jaxbeam.solve.newton import newton, row_magnitudes, topology
+from jaxbeam.solve.newton import Policy, newton, topology
+from jaxbeam.solve.residual import row_magnitudes
 
 # Converged answers of two independent codes: ratios, tip angle in degrees and lengths of the tendons where known.
 REFERENCE = [
@@ -436,9 +437,10 @@ def test_a_state_on_the_way_keeps_its_stiffness_for_a_step_of_a_millionth():
         """How far the stiffness is from that at the end of Newton's method, and the number of its steps."""
         x = scene.mesh.nodes
         start = x.at[2].add(jnp.stack([0.6 * aside, 0.8 * aside]))
-        state = newton(scene, layout, start, 0 * x, jnp.asarray(9), 0, ~no, no, lambda x, definite: 0 * x, solver)
+        policy = Policy(jnp.asarray(9), 0, ~no, no, lambda x, definite: 0 * x)
+        state = newton(scene, layout, start, 0 * x, policy, solver)
         true = row_magnitudes(scene, stencil_hessians(scene, state.x))
-        return jnp.max(jnp.abs(state.stiffness.rows - true)) / jnp.max(true), state.counts[0]
+        return jnp.max(jnp.abs(state.stiffness.rows - true)) / jnp.max(true), state.counts.steps
 
     # One step each. The stiffness is a quotient of lengths, so it changes by about the share that the node moves.
     near, far = off(unlock(scene), 1e-7), off(unlock(scene), 1e-3)

@@ -1,0 +1,74 @@
+"""What a continuation reports of each target, while it runs.
+
+It becomes a `Solution` at the end. Until then it is packed in few arrays, because a loop that carries many compiles
+slowly. Only `pack` and `unpack` know the order of the entries.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Report(NamedTuple):
+    """What is reported of one target: fields of `Solution`, each `()`, but `x` `(n, d)`.
+
+    Steps, projected, halvings and attempts are those of all attempts at the target together.
+    """
+
+    x: jax.Array
+    energy: jax.Array
+    residual: jax.Array
+    correction: jax.Array
+    smallest_jacobian: jax.Array
+    reached: jax.Array
+    steps: jax.Array
+    projected: jax.Array
+    halvings: jax.Array
+    attempts: jax.Array
+    worst_element: jax.Array
+    status: jax.Array
+
+
+FLOATS = ("energy", "residual", "correction", "smallest_jacobian", "reached")
+
+
+INTEGERS = ("steps", "projected", "halvings", "attempts", "worst_element", "status")
+
+
+class PackedReport(NamedTuple):
+    """A `Report` in three arrays, which make a smaller program than twelve: it compiles faster.
+
+    x: `(n, d)` positions.
+    floats: `(5,)` in the order of `FLOATS`.
+    integers: `(6,)` in the order of `INTEGERS`.
+    """
+
+    x: jax.Array
+    floats: jax.Array
+    integers: jax.Array
+
+
+def pack(report: Report) -> PackedReport:
+    """A report in few arrays."""
+    floats = jnp.stack([getattr(report, name) for name in FLOATS])
+    integers = jnp.stack([getattr(report, name) for name in INTEGERS], dtype=jnp.int32)
+    return PackedReport(report.x, floats, integers)
+
+
+def unpack(packed: PackedReport) -> Report:
+    """The report that was packed; leading axes are kept."""
+    floats = {name: packed.floats[..., k] for k, name in enumerate(FLOATS)}
+    integers = {name: packed.integers[..., k] for k, name in enumerate(INTEGERS)}
+    return Report(x=packed.x, **floats, **integers)
+
+
+def zeros(count: int, x: jax.Array) -> PackedReport:
+    """Packed reports of zeros, with leading axis `count`, for positions like `x` `(n, d)`."""
+    return PackedReport(
+        x=jnp.zeros((count, *x.shape), x.dtype),
+        floats=jnp.zeros((count, len(FLOATS)), x.dtype),
+        integers=jnp.zeros((count, len(INTEGERS)), jnp.int32),
+    )

@@ -1,0 +1,121 @@
+"""The tangent stiffness as Newton's method uses it: a positive definite Cholesky factor.
+
+The factor of the true Hessian is taken whenever it exists. Where it does not, the Hessian is blended with a projected
+one (`jaxbeam.physics.projection`) or shifted along its diagonal, by as little as will do: always projecting would make
+convergence linear, and a fully projected Hessian is far too stiff along the soft modes of a snap.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxbeam.core.compiling import compute_if, zeros_like_result
+from jaxbeam.linear.layout import Layout, LinearSolver, assemble
+from jaxbeam.scene.scene import Scene, stencil_hessians
+from jaxbeam.solve.residual import row_magnitudes
+
+# Pivots of a singular stiffness come out at 0.1 to 2.8 eps sqrt(N) times the diagonal on bodies that float free, and at
+# 2.7 and more on slender beams in float32. The sign of a pivot below this many eps sqrt(N) is unknown.
+PIVOT_ROUND_OFF = 2.0
+
+
+# Share of the projected Hessian that is tried first; it is tripled until it is one. Then shifts are added, each ten
+# times the one before.
+FIRST_SHARE = 0.01
+
+
+MAX_BLENDS = 16
+
+
+# Near a bifurcation the negative eigenvalue is tiny, and the smallest projected share would be thousands of times as
+# stiff. So on the way from a saddle this many shifts are tried before any projection, each ten times the one before:
+# from ten times the round-off of a pivot to about a millionth of the stiffness, where the lowest eigenvalues of a beam
+# lie.
+GENTLE_SHIFTS = 8
+
+
+class Stiffness(NamedTuple):
+    """The tangent stiffness, factored.
+
+    factor: positive definite Cholesky factor: of the true Hessian if `definite`, else of a modified one.
+    definite: `()` whether the true Hessian is positive definite.
+    marginal: `()` whether round-off decided that, so that its sign is unknown.
+    rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`.
+    """
+
+    factor: Any
+    definite: jax.Array
+    marginal: jax.Array
+    rows: jax.Array
+
+
+def zero_factor(layout: Layout, dtype: Any, linear: LinearSolver) -> Any:
+    """Zeros in the shape of a factor: a value to start a loop with."""
+    storage = jax.ShapeDtypeStruct(layout.empty.shape, dtype)
+    return zeros_like_result(linear.factor, layout, storage)[0]
+
+
+def largest_diagonal(layout: Layout, storage: jax.Array) -> jax.Array:
+    """The largest magnitude on the diagonal of a matrix, padding apart, `()`."""
+    unknown = layout.slots < layout.position.size
+    return jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
+
+
+def factorise(
+    scene: Scene, layout: Layout, x: jax.Array, finite: jax.Array, leaving_saddle: jax.Array, linear: LinearSolver
+) -> Stiffness:
+    """The stiffness at `x`, with a positive definite factor.
+
+    The matrices tried are, in this order: the true Hessian; the true Hessian shifted by no more than round-off, which
+    makes it `marginal`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing share;
+    the projected Hessian, shifted.
+
+    Args:
+        scene: to be solved.
+        layout: of its matrix.
+        x: `(n, d)` positions.
+        finite: `()` whether the forces there are finite. If not, one factorisation is tried and no more.
+        leaving_saddle: `()` whether shifts are tried before projections.
+        linear: the linear solver.
+    """
+    hessians = stencil_hessians(scene, x)
+    storage = assemble(layout, hessians)
+    diagonal, largest = storage[layout.diagonal], largest_diagonal(layout, storage)
+    round_off = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
+    finite = finite & jnp.isfinite(largest)
+    projected_at = lambda x: assemble(layout, stencil_hessians(scene, x, convex=True))
+    first_blend = jnp.where(leaving_saddle, 2 + GENTLE_SHIFTS, 2)
+
+    def attempt(carry: Any) -> Any:
+        tries, _, _, projected = carry
+        projected = compute_if(tries == first_blend, projected_at, projected, x)
+        share, shift = _modification(tries, first_blend, round_off, storage.dtype)
+        matrix = ((1 - share) * storage + share * projected).at[layout.diagonal].add(shift * largest)
+        factor, done = linear.factor(layout, matrix)
+        return tries + 1, factor, done, projected
+
+    begin = (jnp.zeros((), jnp.int32), zero_factor(layout, storage.dtype, linear), ~finite, jnp.zeros_like(storage))
+    going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] < first_blend + MAX_BLENDS))
+    tries, factor, done, _ = lax.while_loop(going, attempt, begin)
+    smallest_pivot = jnp.min(linear.pivots(layout, factor) / diagonal)
+    small = smallest_pivot <= PIVOT_ROUND_OFF * round_off
+    marginal = done & ((tries == 2) | ((tries == 1) & small))
+    return Stiffness(factor, done & (tries == 1), marginal, row_magnitudes(scene, hessians))
+
+
+def _modification(
+    tries: jax.Array, first_blend: jax.Array, round_off: float, dtype: Any
+) -> tuple[jax.Array, jax.Array]:
+    """How the matrix is modified after so many failed tries.
+
+    Returns:
+        The share `()` of the projected Hessian, and the shift `()` of the diagonal over its largest entry.
+    """
+    blends = (tries - first_blend).astype(dtype)
+    share = jnp.where(blends >= 0, jnp.minimum(1.0, FIRST_SHARE * 3.0**blends), 0.0)
+    gentle = jnp.where(tries > 0, round_off * 10.0 ** (tries - 1).astype(dtype), 0.0)
+    return share, jnp.where(blends < 0, gentle, jnp.where(share < 1, 0.0, 10.0 ** (blends - MAX_BLENDS)))
