@@ -60,7 +60,7 @@ _QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": _PAS
 COMPILER_OPTIONS = _QUICKLY if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
-def _outside() -> bool:
+def outside() -> bool:
     """Whether this is run, not traced: what a jitted function returns is a tracer inside another one."""
     return is_concrete(_zero())
 
@@ -122,7 +122,7 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
         def call(*arguments: Any, **named: Any) -> T:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
-            if is_concrete(*jax.tree.leaves(values)) and _outside():
+            if is_concrete(*jax.tree.leaves(values)) and outside():
                 with _uncollected():
                     return outermost(**values, **settings)
             in_turn = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))

@@ -18,8 +18,7 @@ from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_asked
 from jaxbeam.solve.solution import Solution
-from jaxbeam.study.design import Design, DesignStatus
-from jaxbeam.study.search import History
+from jaxbeam.study.design import Design, DesignStatus, History
 
 # --------------------------------------------------------------------------------------------- minimise
 
