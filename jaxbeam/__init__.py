@@ -72,10 +72,10 @@ from jaxbeam.study.branch import trace_branch as trace_branch
 from jaxbeam.study.by_hand import euler_bernoulli as euler_bernoulli
 from jaxbeam.study.design import Design as Design
 from jaxbeam.study.design import DesignStatus as DesignStatus
+from jaxbeam.study.design import History as History
 from jaxbeam.study.minimise import minimise as minimise
 from jaxbeam.study.reach import reach as reach
 from jaxbeam.study.reach import reach_each as reach_each
-from jaxbeam.study.search import History as History
 from jaxbeam.study.stability import Modes as Modes
 from jaxbeam.study.stability import lowest_mode as lowest_mode
 

@@ -66,7 +66,7 @@ _FAST_COMPILATION = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_pass
 COMPILER_OPTIONS = _FAST_COMPILATION if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
-def _is_outermost() -> bool:
+def is_outermost() -> bool:
     """Whether no transformation is under way. Inside one, a jitted function returns a tracer."""
     return is_concrete(_zero())
 
@@ -128,7 +128,7 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
         def call(*arguments: Any, **named: Any) -> T:
             values = signature.bind(*arguments, **named).arguments
             settings = {name: values.pop(name) for name in static}
-            if is_concrete(*jax.tree.leaves(values)) and _is_outermost():
+            if is_concrete(*jax.tree.leaves(values)) and is_outermost():
                 with _without_garbage_collection():
                     return outermost(**values, **settings)
             in_sequence = jax.custom_batching.sequential_vmap(lambda values: inner(**values, **settings))

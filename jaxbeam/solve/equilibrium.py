@@ -27,13 +27,13 @@ from jaxbeam.scene.scene import (
     commands_of,
     energy,
     evaluate,
-    partway,
     placed,
     smallest_jacobian,
     stencil_hessians,
     worst_element,
 )
 from jaxbeam.scene.supports import check_held
+from jaxbeam.solve.actuation import Origin, from_rest, scene_between
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.implicit import follow_scene, follow_zero, linear_gradient
 from jaxbeam.solve.newton import Newton, check_asked, check_linear, topology
@@ -69,8 +69,9 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
     layout = solver.linear.layout(topology(scene))
     open_scene, x = unlock(scene), start(scene, x0)
     if is_concrete(x, *jax.tree.leaves(scene)):
-        return _equilibrium(open_scene, layout, x, solver)[0]
-    solution, factor = _equilibrium(*lax.stop_gradient((open_scene, layout, x)), solver)
+        return solve_from(from_rest(open_scene, x), open_scene, layout, solver)[0]
+    still, layout, x = lax.stop_gradient((open_scene, layout, x))
+    solution, factor = solve_from(from_rest(still, x), still, layout, solver)
     return differentiable(open_scene, layout, solution, factor, solver)
 
 
@@ -123,9 +124,15 @@ def _moving_response(
 
 
 @compiled("solver")
-def _equilibrium(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> tuple[Solution, Any]:
-    trail = begin(scene.mesh.nodes)
-    path, factor, _ = follow(lambda s: partway(scene, s), layout, trail, jnp.ones(1, x.dtype), solver, x)
+def solve_from(origin: Origin, scene: Scene, layout: Layout, solver: Newton) -> tuple[Solution, Any]:
+    """The equilibrium of an unlocked scene and the factor of its stiffness; approached from `origin` if need be.
+
+    Where the origin lies is data: `equilibrium` and the searches of `reach` run the same compiled program.
+    """
+    trail = begin(origin.x, origin.ahead)._replace(depth=origin.known)
+    way = lambda s: scene_between(origin, scene, s)
+    targets = jnp.ones(1, scene.mesh.nodes.dtype)
+    path, factor, _ = follow(way, layout, trail, targets, solver, origin.first, origin.ahead)
     return jax.tree.map(lambda leaf: leaf[0], path), factor
 
 

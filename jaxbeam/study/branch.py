@@ -133,6 +133,22 @@ def trace_branch(
         EquilibriumError: if there is no equilibrium at the start.
     """
     check_asked(scene, solver)
+    interval, parameter, step = _check_way(direction, interval, parameter, step)
+    checks.count("max_points", max_points, 1)
+    dtype = scene.mesh.nodes.dtype
+    command(scene, ratios)  # checks the ratios
+    path = Path(scene, jnp.asarray(ratios, dtype), solver.linear.layout(topology(scene)), solver)
+    x = _first_state(path, parameter, x0)
+    zero = jnp.zeros_like(x)
+    here = Point(x, jnp.asarray(parameter, dtype), zero, jnp.asarray(direction, dtype), *3 * [jnp.zeros((), int)])
+    points, critical, ended = _walk(path, path.advance(here, 0.0), interval, step, max_points, progress)
+    return _branch(path, points, critical, ended)
+
+
+def _check_way(
+    direction: int, interval: tuple[float, float], parameter: float, step: float
+) -> tuple[tuple[float, float], float, float]:
+    """Interval, parameter and step as plain numbers, checked with the direction."""
     if isinstance(direction, bool) or direction not in (1, -1):
         raise ValueError(f"direction: expected 1 or -1, got {direction!r}")
     step, parameter = checks.setting("step", step, checks.POSITIVE), checks.setting("parameter", parameter)
@@ -141,53 +157,79 @@ def trace_branch(
         raise ValueError(
             f"expected interval[0] <= parameter <= interval[1], got interval {interval!r}, parameter {parameter!r}"
         )
-    checks.count("max_points", max_points, 1)
-    dtype = scene.mesh.nodes.dtype
-    command(scene, ratios)  # checks the ratios
-    end = jnp.asarray(ratios, dtype)
-    layout = solver.linear.layout(topology(scene))
-    begin = dataclasses.replace(solver, escape=False)
-    at_start = command(scene, 1 + parameter * (end - 1))
-    found = equilibrium(at_start, x0, begin)
+    return (low, high), parameter, step
+
+
+class Path(NamedTuple):
+    """The scenes whose equilibria are traced: the commands `1 + s (end - 1)`."""
+
+    scene: Scene
+    end: jax.Array
+    layout: Layout
+    solver: Newton
+
+    def scene_at(self, s: jax.Array | float) -> Scene:
+        return command(self.scene, 1 + s * (self.end - 1))
+
+    def advance(self, here: Point, length: float) -> Point:
+        """The point of the branch at `length` along the tangent of `here`."""
+        size = jnp.asarray(length, here.s.dtype)
+        return _advance(unlock(self.scene), self.layout, self.end, here, size, solver=self.solver)
+
+
+def _first_state(path: Path, parameter: float, x0: Numbers | None) -> jax.Array:
+    """The equilibrium `(n, 2)` to start at."""
+    found = equilibrium(path.scene_at(parameter), x0, dataclasses.replace(path.solver, escape=False))
     # A saddle, a critical point or a body that overlaps itself lies on a branch as well as any other state.
     if found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID):
         check(found)
-    data = unlock(scene)
-    advance = partial(_advance, data, layout, end, solver=solver)
-    zero = jnp.zeros_like(found.x)
-    here = Point(found.x, jnp.asarray(parameter, dtype), zero, jnp.asarray(direction, dtype), *3 * [jnp.zeros((), int)])
-    points = [advance(here, jnp.zeros((), dtype))]
+    return found.x
+
+
+def _walk(
+    path: Path,
+    first: Point,
+    interval: tuple[float, float],
+    step: float,
+    max_points: int,
+    progress: Callable[[int, float], None] | None,
+) -> tuple[list[Point], list[Critical], str]:
+    """Points from the `first` one on, the critical points between them, and why they end."""
+    tolerance, size = path.solver.tolerance(first.x.dtype), float(extent(path.scene))
+    points, length = [first], step
     critical: list[Critical] = []
-    length, ended = step, "points"
     while len(points) < max_points:
-        old, new = points[-1], advance(points[-1], jnp.asarray(length, dtype))
-        if not float(new.residual) <= solver.tolerance(dtype) or _strays(old, new, length, float(extent(scene))):
+        old, new = points[-1], path.advance(points[-1], length)
+        if not float(new.residual) <= tolerance or _strays(old, new, length, size):
             length /= 2
             # Also where the step is infinite, and half of it as well.
             if not length > 1e-6 * step:
-                ended = "step"
-                break
+                return points, critical, "step"
             continue
         if int(new.negative) != int(old.negative):
-            critical.append(_locate(scene, end, advance, old, new, length, len(points) - 1, solver))
+            critical.append(_locate(path, old, new, length, len(points) - 1))
         points.append(new)
         if int(new.corrections) <= EASY:
             length = min(1.5 * length, step)
         if progress is not None:
             progress(len(points), float(new.s))
-        if not low <= float(new.s) <= high:
-            ended = "left"
-            break
-    stack = lambda name: np.stack([np.asarray(getattr(p, name)) for p in points])
+        if not interval[0] <= float(new.s) <= interval[1]:
+            return points, critical, "left"
+    return points, critical, "points"
+
+
+def _branch(path: Path, points: list[Point], critical: list[Critical], ended: str) -> Branch:
+    """The record of a walk."""
+    stack = lambda name: np.stack([np.asarray(getattr(point, name)) for point in points])
     s, x = stack("s"), stack("x")
     return Branch(
         parameter=s,
-        ratios=1 + s[:, None] * (np.asarray(end) - 1),
+        ratios=1 + s[:, None] * (np.asarray(path.end) - 1),
         x=x,
         negative=stack("negative"),
         residual=stack("residual"),
-        smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(scene, y))(jnp.asarray(x))),
-        overlapping=np.asarray(lax.map(lambda y: crossing(scene, y)[0, 0] >= 0, jnp.asarray(x))),
+        smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(path.scene, y))(jnp.asarray(x))),
+        overlapping=np.asarray(lax.map(lambda y: crossing(path.scene, y)[0, 0] >= 0, jnp.asarray(x))),
         critical=tuple(critical),
         ended=ended,
     )
@@ -257,16 +299,7 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
     return point._replace(residual=jnp.where(done, point.residual, jnp.inf))
 
 
-def _locate(
-    scene: Scene,
-    end: jax.Array,
-    advance: Callable[[Point, jax.Array], Point],
-    old: Point,
-    new: Point,
-    length: float,
-    after: int,
-    solver: Newton,
-) -> Critical:
+def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Critical:
     """The critical point between two neighbours: the root, along the branch, of the eigenvalue that changes sign.
 
     Regula falsi with the Illinois rule (Dowell and Jarratt 1971).
@@ -274,7 +307,7 @@ def _locate(
     which = min(int(old.negative), int(new.negative))
 
     def eigen(point: Point) -> tuple[float, jax.Array]:
-        modes = lowest_mode(command(scene, 1 + point.s * (end - 1)), point.x, which + 1, solver)
+        modes = lowest_mode(path.scene_at(point.s), point.x, which + 1, path.solver)
         return float(modes.values[which]), modes.shapes[which]
 
     low, high = 0.0, length
@@ -282,7 +315,7 @@ def _locate(
     scale, side, value = max(abs(f_low), abs(f_high)), 0, f_high
     for _ in range(60):
         middle = (low * f_high - high * f_low) / (f_high - f_low)
-        point = advance(old, jnp.asarray(middle, old.s.dtype))
+        point = path.advance(old, middle)
         value, shape = eigen(point)
         if abs(value) <= 1e-10 * scale or high - low <= 1e-13 * length:
             break
@@ -294,6 +327,6 @@ def _locate(
             low, f_low = middle, value
             f_high *= 0.5 if side == -1 else 1.0
             side = -1
-    ratios = np.asarray(1 + point.s * (end - 1))
+    ratios = np.asarray(1 + point.s * (path.end - 1))
     kind = "fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation"
     return Critical(kind, float(point.s), ratios, point.x, shape, value, after)

@@ -9,7 +9,6 @@ import jax
 
 from jaxbeam.core.tree import pytree
 from jaxbeam.solve.solution import Solution
-from jaxbeam.study.search import History
 
 
 class DesignStatus(enum.IntEnum):
@@ -18,6 +17,18 @@ class DesignStatus(enum.IntEnum):
     REACHED = 0
     UNREACHABLE = 1
     NOT_CONVERGED = 2
+
+
+@pytree
+class History:
+    """What was tried, in order; NaN (status -1) beyond what was needed.
+
+    theta: `(K, ...)` parameters. loss: `(K,)`. status: `(K,)` of their equilibria; one that is not `OK` was skipped.
+    """
+
+    theta: Any
+    loss: jax.Array
+    status: jax.Array
 
 
 @pytree

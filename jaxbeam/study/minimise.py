@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,7 @@ from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_asked
 from jaxbeam.solve.solution import Solution
-from jaxbeam.study.design import Design, DesignStatus
-from jaxbeam.study.search import History
+from jaxbeam.study.design import Design, DesignStatus, History
 
 # --------------------------------------------------------------------------------------------- minimise
 
@@ -64,32 +64,63 @@ def minimise(
     Raises:
         ValueError: if `steps` is not a whole number of at least 0, `theta0` holds no floats, or as `design` does.
     """
-    for name, value, form in (("loss", loss, "(scene, x) -> scalar"), ("design", design, "(theta) -> scene")):
-        checks.function(name, value, form)
-    if not hasattr(optimiser, "update"):
-        raise ValueError(f"optimiser: expected one of optax, such as optax.adam(1e-2), got {optimiser!r}")
-    checks.count("steps", steps, 0)
-    tolerance = checks.setting("tolerance", tolerance, checks.NOT_NEGATIVE)
-    goal = None if goal is None else checks.setting("goal", goal)
-    # A weak dtype turns strong in the first update, and all would be compiled again.
-    strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype))
-    theta = strong(theta0)
+    tolerance, goal = _check_arguments(loss, design, optimiser, steps, tolerance, goal)
+    theta = _strong(theta0)
     leaves = jax.tree.leaves(theta)
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise ValueError(f"theta0: expected a pytree of float arrays, got {theta0!r}")
     first = design(theta)
     check_asked(first, solver)
     check_held(first)
+    programs = _programs(loss, design, optimiser, solver)
+    state = DescentState(theta, first.mesh.nodes, _strong(programs.init(theta)), last=theta)
+    _descend(state, programs, steps, tolerance, goal, progress)
+    return _report(state)
+
+
+def _check_arguments(
+    loss: Any, design: Any, optimiser: Any, steps: int, tolerance: float, goal: float | None
+) -> tuple[float, float | None]:
+    """The tolerance and the goal, checked with the rest."""
+    for name, value, form in (("loss", loss, "(scene, x) -> scalar"), ("design", design, "(theta) -> scene")):
+        checks.function(name, value, form)
+    if not hasattr(optimiser, "update"):
+        raise ValueError(f"optimiser: expected one of optax, such as optax.adam(1e-2), got {optimiser!r}")
+    checks.count("steps", steps, 0)
+    tolerance = checks.setting("tolerance", tolerance, checks.NOT_NEGATIVE)
+    return tolerance, None if goal is None else checks.setting("goal", goal)
+
+
+def _strong(tree: Any) -> Any:
+    """Its leaves as arrays of a definite dtype: a weak one turns strong in the first update, and all would be compiled
+    again."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
+
+
+# ---------------------------------------------------------------------------------------------- the loop
+
+
+class Programs(NamedTuple):
+    """What is compiled, for one loss and one optimiser.
+
+    evaluate: `(theta, x)` to the loss with its solution, and the gradient. init: `theta` to the optimiser's state.
+    advance: `(theta, state, gradient, loss, x)` to the next `theta` and state.
+    """
+
+    evaluate: Callable[..., Any]
+    init: Callable[..., Any]
+    advance: Callable[..., Any]
+
+
+def _programs(loss: Any, design: Any, optimiser: optax.GradientTransformation, solver: Newton) -> Programs:
 
     def objective(theta: Any, x: jax.Array) -> tuple[jax.Array, Solution]:
         scene = design(theta)
         solution = equilibrium(scene, x, solver)
         return loss(scene, solution.x), solution
 
-    evaluate = jax.jit(jax.value_and_grad(objective, has_aux=True))
-
     def finite_loss(theta: Any, x: jax.Array) -> jax.Array:
-        """What a line search sees: no loss at all where there is no equilibrium."""
+        """What a line search sees: an infinite loss where there is no equilibrium."""
         value, solution = objective(theta, x)
         return jnp.where(solution.status == 0, value, jnp.inf)
 
@@ -101,52 +132,96 @@ def minimise(
         updates, state = transform.update(grad, state, theta, value=value, grad=grad, value_fn=value_fn)
         return optax.apply_updates(theta, updates), state
 
-    halfway = jax.jit(lambda a, b: jax.tree.map(lambda x, y: 0.5 * (x + y), a, b))
-    state, x = strong(transform.init(theta)), first.mesh.nodes
-    tried: list[tuple[Any, float, int]] = []
+    return Programs(jax.jit(jax.value_and_grad(objective, has_aux=True)), transform.init, advance)
+
+
+@dataclasses.dataclass
+class DescentState:
+    """Where a minimisation is.
+
+    theta: parameters to try next. x: `(n, 2)` the equilibrium to start from. optimiser: the optimiser's state.
+    last: the last parameters that have an equilibrium. first_slope: largest component of the first gradient.
+    solves: equilibria solved. skips: steps taken back in a row. best: parameters, solution and loss of the best.
+    tried: parameters, loss and status of each.
+    """
+
+    theta: Any
+    x: jax.Array
+    optimiser: Any
+    last: Any
+    first_slope: float = 0.0
+    solves: int = 0
+    skips: int = 0
     best: tuple[Any, Solution, float] | None = None
-    last, first_slope, solves, skips, status = theta, 0.0, 0, 0, DesignStatus.NOT_CONVERGED
+    tried: list[tuple[Any, float, int]] = dataclasses.field(default_factory=list)
+    status: DesignStatus = DesignStatus.NOT_CONVERGED
+
+
+def _descend(
+    state: DescentState,
+    programs: Programs,
+    steps: int,
+    tolerance: float,
+    goal: float | None,
+    progress: Callable[[int, float], None] | None,
+) -> None:
+    """Step by step until the loss is at the goal, or stationary, or there is no going on."""
     for count in range(steps + 1):
-        (value, solution), grad = evaluate(theta, x)
-        number = float(value)
-        slope = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(grad))
-        solves += 1
-        tried.append((theta, number, int(solution.status)))
+        (value, solution), grad = programs.evaluate(state.theta, state.x)
+        slope = max(float(np.max(np.abs(leaf))) for leaf in jax.tree.leaves(grad))
+        good = _record(state, solution, float(value), slope)
         if progress:
-            progress(count, number)
-        good = int(solution.status) == 0 and np.isfinite(number) and np.isfinite(slope)
-        if best is None or (good and number < best[2]):
-            best = (theta, solution, number if good else np.inf)
+            progress(count, float(value))
         if not good:
-            skips += 1
-            if count == 0 or skips > MAX_SKIPS:
-                break
-            theta = halfway(last, theta)
+            state.skips += 1
+            if count == 0 or state.skips > MAX_SKIPS:
+                return
+            state.theta = _halfway(state.last, state.theta)
             continue
-        last, x, skips = theta, solution.x, 0
-        first_slope = first_slope or slope
-        if goal is not None and number <= goal:
-            status = DesignStatus.REACHED
-            break
-        if slope <= tolerance * first_slope:
-            status = DesignStatus.REACHED if goal is None else DesignStatus.UNREACHABLE
-            break
+        state.last, state.x, state.skips = state.theta, solution.x, 0
+        state.first_slope = state.first_slope or slope
+        if goal is not None and float(value) <= goal:
+            state.status = DesignStatus.REACHED
+            return
+        if slope <= tolerance * state.first_slope:
+            state.status = DesignStatus.REACHED if goal is None else DesignStatus.UNREACHABLE
+            return
         if count < steps:
-            theta, state = advance(theta, state, grad, value, x)
-            solves += int(optax.tree_utils.tree_get(state, "num_linesearch_steps", default=0))
-    assert best is not None
-    thetas, losses, statuses = zip(*tried, strict=True)
+            state.theta, state.optimiser = programs.advance(state.theta, state.optimiser, grad, value, state.x)
+            state.solves += int(optax.tree_utils.tree_get(state.optimiser, "num_linesearch_steps", default=0))
+
+
+def _record(state: DescentState, solution: Solution, loss: float, slope: float) -> bool:
+    """Note what was tried, and say whether it can be gone on from."""
+    status = int(solution.status)
+    state.solves += 1
+    state.tried.append((state.theta, loss, status))
+    good = status == 0 and bool(np.isfinite(loss)) and bool(np.isfinite(slope))
+    if state.best is None or (good and loss < state.best[2]):
+        state.best = (state.theta, solution, loss if good else np.inf)
+    return good
+
+
+@jax.jit
+def _halfway(a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda x, y: 0.5 * (x + y), a, b)
+
+
+def _report(state: DescentState) -> Design:
+    assert state.best is not None
+    theta, solution, loss = state.best
+    thetas, losses, statuses = zip(*state.tried, strict=True)
     return Design(
-        theta=best[0],
-        solution=best[1],
-        value=jnp.asarray(best[2]),
-        loss=jnp.asarray(best[2]),
+        theta=theta,
+        solution=solution,
+        value=jnp.asarray(loss),
+        loss=jnp.asarray(loss),
         held=jnp.zeros(0, jnp.int32),
-        solves=jnp.asarray(solves, jnp.int32),
+        solves=jnp.asarray(state.solves, jnp.int32),
         history=History(
             jax.tree.map(lambda *each: jnp.stack(each), *thetas),
             jnp.asarray(losses),
             jnp.asarray(statuses, jnp.int32),
         ),
-        status=jnp.asarray(status, jnp.int32),
+        status=jnp.asarray(state.status, jnp.int32),
     )

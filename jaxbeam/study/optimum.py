@@ -23,14 +23,26 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxbeam.core.derivative import custom_derivative
-from jaxbeam.core.tree import unlock
-from jaxbeam.linear.layout import LinearSolver, assemble
-from jaxbeam.scene.scene import command, stencil_hessians
+from jaxbeam.core.tree import pytree, unlock
+from jaxbeam.linear.layout import Layout, LinearSolver, assemble
+from jaxbeam.scene.scene import Scene, command, stencil_hessians
 from jaxbeam.solve.equilibrium import differentiable
 from jaxbeam.solve.implicit import follow_scene
 from jaxbeam.solve.newton import Newton
 from jaxbeam.solve.solution import Solution
-from jaxbeam.study.search import REST, Measure, Problem
+from jaxbeam.study.expansion import Measure
+from jaxbeam.study.search import REST
+
+
+@pytree
+class Problem:
+    """What is the same for every target. `low`, `high` `(m,)`, `tolerance` `()`."""
+
+    scene: Scene
+    layout: Layout
+    low: jax.Array
+    high: jax.Array
+    tolerance: jax.Array
 
 
 class Answer(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -11,15 +13,16 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import choose, usual_rules, zeros_like_result
-from jaxbeam.core.tree import Numbers, is_concrete, replace
+from jaxbeam.core.compiling import is_outermost, usual_rules
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene, command_count
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_asked, topology
-from jaxbeam.study.design import Design, DesignStatus
-from jaxbeam.study.optimum import Answer, move_answer
-from jaxbeam.study.search import Measure, Problem, Stand, effects, search
+from jaxbeam.study.design import Design, DesignStatus, History
+from jaxbeam.study.expansion import Measure
+from jaxbeam.study.optimum import Answer, Problem, move_answer
+from jaxbeam.study.search import SearchState, Task, Trial, search
 
 # ------------------------------------------------------------------------------------------------ reach
 
@@ -35,6 +38,7 @@ def reach(
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
+    progress: Callable[[int, float], None] | None = None,
 ) -> Design:
     """Commands within `bounds` at which `measure` of the equilibrium is `target`.
 
@@ -54,6 +58,7 @@ def reach(
             float32 1e-3.
         max_solves: equilibria to solve at most, from each start.
         solver: settings of each solve.
+        progress: called after each solve with the number of solves so far and the distance from the target.
 
     Returns:
         A `Design` of status `REACHED`, or `UNREACHABLE`: then `value` is the nearest that was found, and `held` says
@@ -67,15 +72,17 @@ def reach(
     it, for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
 
     Raises:
-        ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does.
+        ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does; or
+            inside `jit` or `vmap`, for the search is a loop on the host.
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
     goal = checks.numbers("target", target)
     if goal.shape != shape:
         raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
-    goal, most = jnp.asarray(goal, scene.mesh.nodes.dtype), int(max_solves)
-    found = _reach(*lax.stop_gradient((problem, goal, begin)), measure, most, solver)
+    goal = jnp.asarray(goal, scene.mesh.nodes.dtype)
+    task, goals, begin = _on_host(problem, goal[None], begin, measure, int(max_solves), solver, progress)
+    found = _each_in_turn(task, goals, begin)[0]
     if is_concrete(*jax.tree.leaves((problem, goal))):
         return found
     return _moving(problem, goal, found, measure, solver)
@@ -92,11 +99,12 @@ def reach_each(
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
+    progress: Callable[[int, float], None] | None = None,
 ) -> Design:
     """Commands for each of a sequence of targets `(T,)` or `(T, p)`, each started from the answer before.
 
-    So a tip draws a path, in one `lax.scan`: neighbouring targets take few solves each. The first is found as by
-    `reach`. Arguments, errors, answer and derivatives are those of `reach`, with leading axis `T`.
+    So a tip draws a path: neighbouring targets take few solves each. The first is found as by `reach`. Arguments,
+    errors, answer and derivatives are those of `reach`, with leading axis `T`; `progress` counts the solves of all.
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
@@ -104,8 +112,10 @@ def reach_each(
     if goals.ndim != len(shape) + 1 or goals.shape[1:] != shape or not goals.shape[0]:
         rows = f"(T, {shape[0]})" if shape else "(T,)"
         raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
-    goals, most = jnp.asarray(goals, scene.mesh.nodes.dtype), int(max_solves)
-    found = _reach_each(*lax.stop_gradient((problem, goals, begin)), measure, most, solver)
+    goals = jnp.asarray(goals, scene.mesh.nodes.dtype)
+    task, targets, begin = _on_host(problem, goals, begin, measure, int(max_solves), solver, progress)
+    each = _each_in_turn(task, targets, begin)
+    found = jax.tree.map(lambda *rows: to_device(np.stack(rows)), *each)
     if is_concrete(*jax.tree.leaves((problem, goals))):
         return found
     return _moving_each(problem, goals, found, measure, solver)
@@ -118,7 +128,7 @@ def _problem(
     tolerance: float | None,
     max_solves: int,
     solver: Newton,
-) -> tuple[Problem, jax.Array]:
+) -> tuple[Problem, Any]:
     """The checked problem, and the commands `(S, m)` to start from."""
     check_asked(scene, solver)
     checks.count("max_solves", max_solves, 1)
@@ -137,15 +147,16 @@ def _problem(
         end = checks.numbers(f"bounds, {name}", bound)
         if end.shape not in ((), (count,)):
             raise ValueError(f"bounds: expected {name} of shape () or ({count},), got {end.shape}")
-        ends.append(jnp.broadcast_to(jnp.asarray(end, dtype), (count,)))
+        xp = namespace(end)
+        ends.append(to_device(xp.broadcast_to(xp.asarray(end, dtype), (count,))))
     low, high = ends
     if is_concrete(low, high) and not ((np.asarray(low) > 0) & (np.asarray(low) <= np.asarray(high))).all():
         raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
-    begin = jnp.asarray(np.ones((1, count)) if starts is None else checks.numbers("starts", starts), dtype)
+    begin = np.ones((1, count)) if starts is None else checks.numbers("starts", starts)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
     problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
-    return problem, jnp.clip(begin, low, high)
+    return problem, begin
 
 
 def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
@@ -155,55 +166,6 @@ def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
     if len(shape) > 1:
         raise ValueError(f"measure: expected a function (scene, x) to shape () or (p,), got shape {shape}")
     return shape
-
-
-@partial(jax.jit, static_argnames=("measure", "max_solves", "solver"))
-def _reach(
-    problem: Problem, target: jax.Array, begin: jax.Array, measure: Measure, max_solves: int, solver: Newton
-) -> Design:
-    rest, ones = problem.scene.mesh.nodes, jnp.ones_like(problem.low)
-
-    def once(theta: jax.Array) -> Design:
-        return _design(problem, target, search(problem, target, ones, theta - 1, rest, measure, max_solves, solver))
-
-    def attempt(carry: tuple[jax.Array, jax.Array, Design]) -> tuple[jax.Array, jax.Array, Design]:
-        turn, theta, best = carry
-        found = once(theta)
-        solves = best.solves + found.solves
-        better = (turn == 0) | ((found.status != DesignStatus.NOT_CONVERGED) & (found.loss < best.loss))
-        return turn + 1, found.theta, replace(choose(better, found, best), solves=solves)
-
-    def going(carry: tuple[jax.Array, jax.Array, Design]) -> jax.Array:
-        turn, _, best = carry
-        return (turn == 0) | ((turn == 1) & (best.status == DesignStatus.UNREACHABLE))
-
-    def from_start(theta: jax.Array) -> Design:
-        # What cannot be reached is searched once more from there, approached from rest: the search may have come
-        # to it by way of a state that a beam pulled straight to it does not take.
-        return lax.while_loop(going, attempt, (jnp.zeros((), jnp.int32), theta, zeros_like_result(once, theta)))[2]
-
-    found = lax.map(from_start, begin)
-    # The nearest; among those that reach the target the one of least effort.
-    reached = found.status == DesignStatus.REACHED
-    effort = jnp.sum((1 - found.theta) ** 2, axis=1)
-    nearness = jnp.where(reached, -1, jnp.where(jnp.isfinite(found.loss), found.loss, jnp.inf))
-    best = jnp.lexsort((effort, nearness, found.status == DesignStatus.NOT_CONVERGED))[0]
-    return jax.tree.map(lambda leaf: leaf[best], found)
-
-
-@partial(jax.jit, static_argnames=("measure", "max_solves", "solver"))
-def _reach_each(
-    problem: Problem, targets: jax.Array, begin: jax.Array, measure: Measure, max_solves: int, solver: Newton
-) -> Design:
-    first = _reach(problem, targets[0], begin, measure, max_solves, solver)
-
-    def following(carry: tuple[jax.Array, jax.Array], target: jax.Array) -> tuple[Any, Design]:
-        theta, x = carry
-        at = search(problem, target, theta, jnp.zeros_like(theta), x, measure, max_solves, solver)
-        found = _design(problem, target, at)
-        return (found.theta, found.solution.x), found
-
-    return lax.scan(following, (first.theta, first.solution.x), targets)[1]
 
 
 @partial(jax.jit, static_argnames=("measure", "solver"))
@@ -217,9 +179,9 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
         trusted=(found.status != DesignStatus.NOT_CONVERGED) & (found.solution.status == 0),
     )
     theta, solution, value = move_answer(measure, solver, problem, target, answer, found.solution)
-    # At zero, where it stays, the distance has no slope; nor has that of a number that is none.
-    miss, far = jnp.ravel(value - target), jnp.isfinite(found.loss) & (found.loss != 0)
-    loss = jnp.where(far, jnp.linalg.norm(jnp.where(far, miss, 1)), jnp.sum(miss))
+    # The slope of the distance exists nowhere at zero, where it stays.
+    miss, away = jnp.ravel(value - target), found.loss != 0
+    loss = jnp.where(away, jnp.linalg.norm(jnp.where(away, miss, 1)), 0 * jnp.sum(miss))
     return replace(found, theta=theta, solution=solution, value=value, loss=loss)
 
 
@@ -230,19 +192,110 @@ def _moving_each(problem: Problem, targets: jax.Array, found: Design, measure: M
     return lax.map(each, (targets, found))
 
 
-def _design(problem: Problem, target: jax.Array, at: Stand) -> Design:
-    """The report of a search."""
-    close = jnp.max(jnp.abs(at.miss)) <= problem.tolerance
-    # Without any effect of any command there is no telling what is in reach.
-    known = close | jnp.any(effects(at, jnp.ravel(target)))
-    ended = jnp.where(close, DesignStatus.REACHED, DesignStatus.UNREACHABLE)
+# ------------------------------------------------------------------------------------------ on the host
+
+
+def _on_host(
+    problem: Problem,
+    targets: Any,
+    begin: Any,
+    measure: Measure,
+    max_solves: int,
+    solver: Newton,
+    progress: Callable[[int, float], None] | None,
+) -> tuple[Task, np.ndarray, np.ndarray]:
+    """What is searched for, without a target, the targets `(T, ...)` and the starts `(S, m)`, as numbers of the host.
+
+    Raises:
+        ValueError: if a value is traced by more than derivatives.
+    """
+    values = problem, targets, begin
+    if not is_concrete(*jax.tree.leaves(values)):
+        values = lax.stop_gradient(values)
+    if not is_concrete(*jax.tree.leaves(values)) or not is_outermost():
+        raise ValueError(
+            "scene, target, bounds: expected concrete values, got traced ones; reach and reach_each run on the host: "
+            "call them outside jit, vmap and scan; jax.grad, jax.jacfwd and jax.jacrev of them work outside jit"
+        )
+    known, goals, starts = values
+    low, high = np.asarray(known.low, float), np.asarray(known.high, float)
+    count = itertools.count(1)
+    task = Task(
+        scene=known.scene,
+        layout=known.layout,
+        target=np.zeros(0),
+        low=low,
+        high=high,
+        tolerance=float(known.tolerance),
+        measure=measure,
+        max_solves=max_solves,
+        solver=solver,
+        report=lambda distance: progress(next(count), distance) if progress else None,
+    )
+    return task, np.asarray(goals, float), np.clip(np.asarray(starts, float), low, high)
+
+
+def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[Design]:
+    """The design of each target `(T, ...)`, searched from the answer before."""
+    before: Trial | None = None
+    designs = []
+    for target in targets:
+        one = task._replace(target=np.ravel(target))
+        state = _search_all(one, begin) if before is None else search(one, before.theta, before)
+        before = before if state.here is None else state.here
+        designs.append(_design(one, state, target.shape))
+    return designs
+
+
+def _search_all(task: Task, begin: np.ndarray) -> SearchState:
+    """The best answer from all the starts `(S, m)`."""
+    found = [_search_twice(task, theta) for theta in begin]
+
+    def rank(state: SearchState) -> tuple[bool, float, float]:
+        """The nearest is best; among those that reach the target the one of least effort."""
+        if state.here is None:
+            return True, np.inf, np.inf
+        nearness = -1.0 if state.status == DesignStatus.REACHED else state.here.distance
+        return state.status == DesignStatus.NOT_CONVERGED, nearness, state.here.effort
+
+    return min(found, key=rank)
+
+
+def _search_twice(task: Task, theta: np.ndarray) -> SearchState:
+    """A search from the commands `theta` `(m,)` at rest, and another one from its answer if that is out of reach.
+
+    The second approaches the answer from rest: the first may have come to it by way of a state that a beam pulled
+    straight to it does not take.
+    """
+    found = search(task, theta)
+    if found.status != DesignStatus.UNREACHABLE or found.here is None:
+        return found
+    again = search(task, found.here.theta)
+    solves = found.solves + again.solves
+    if again.status != DesignStatus.NOT_CONVERGED and again.here is not None:
+        found = again if again.here.distance < found.here.distance else found
+    found.solves = solves
+    return found
+
+
+def _design(task: Task, state: SearchState, shape: tuple[int, ...]) -> Design:
+    """The report of a search, with a value of this `shape`."""
+    dtype, most = task.scene.mesh.nodes.dtype, task.max_solves
+    # Without any equilibrium, the one that failed.
+    at = state.last if state.here is None else state.here
+    assert at is not None
+    miss = at.miss if state.here is not None else np.full(at.miss.shape, np.inf)
+    theta, loss = np.full((most, at.theta.size), np.nan, dtype), np.full(most, np.nan, dtype)
+    status = np.full(most, -1, np.int32)
+    for k, each in enumerate(state.tried):
+        theta[k], loss[k], status[k] = each
     return Design(
-        theta=at.theta,
+        theta=to_device(at.theta.astype(dtype)),
         solution=at.solution,
-        value=at.miss.reshape(target.shape) + target,
-        loss=jnp.linalg.norm(at.miss),
-        held=at.held,
-        solves=at.solves,
-        history=at.history,
-        status=jnp.where(at.resting & known, ended, DesignStatus.NOT_CONVERGED).astype(jnp.int32),
+        value=to_device((miss + task.target).astype(dtype).reshape(shape)),
+        loss=to_device(np.linalg.norm(miss), dtype),
+        held=to_device(state.held),
+        solves=to_device(state.solves, np.int32),
+        history=History(to_device(theta), to_device(loss), to_device(status)),
+        status=to_device(state.status, np.int32),
     )

@@ -9,7 +9,8 @@ import pytest
 from helpers import run_python
 
 import jaxbeam as jb
-from jaxbeam.solve.equilibrium import _equilibrium
+from jaxbeam.solve.actuation import from_rest
+from jaxbeam.solve.equilibrium import solve_from
 from jaxbeam.solve.newton import topology
 
 ANGLE = 0.01  # degrees, demanded of float32 against float64
@@ -52,7 +53,7 @@ def test_nothing_is_promoted_in_silence(single):
     """Traced under JAX's strict promotion: no float32 meets a float64, and no integer or boolean turns into a float."""
     solver = jb.Newton()
     layout = solver.linear.layout(topology(single))
-    solve = lambda scene, x: _equilibrium.__wrapped__(scene, layout, x, solver)
+    solve = lambda scene, x: solve_from.__wrapped__(from_rest(scene, x), scene, layout, solver)
     with jax.numpy_dtype_promotion("strict"):
         jaxpr = str(jax.make_jaxpr(solve)(single, single.mesh.nodes))
     assert "f32[203,2]" in jaxpr

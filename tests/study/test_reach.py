@@ -243,8 +243,43 @@ def test_no_slope_is_no_information(small):
 def test_each_of_several_targets_with_slack_tendons():
     """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that
     is slack where the first ended, where only the other one has an effect."""
-    found = jax.jit(partial(jb.reach_each, threaded(1.2)))(jnp.array([4.0, jnp.nan, -4.0]))
+    targets = jnp.array([4.0, jnp.nan, -4.0])
+    found, _ = jax.jvp(partial(jb.reach_each, threaded(1.2)), (targets,), (jnp.ones(3),))
     assert np.asarray(found.status).tolist() == [REACHED, NOT_CONVERGED, REACHED]
+
+
+# ------------------------------------------------------------------------------------------ on the host
+
+
+def test_progress(small):
+    """Called after each solve with the number of all so far and the distance from the target."""
+    calls = []
+    found = jb.reach(small, 8.0, progress=lambda *call: calls.append(call))
+    count = int(found.solves)
+    assert [number for number, _ in calls] == list(range(1, count + 1))
+    np.testing.assert_array_equal([loss for _, loss in calls], found.history.loss[:count])
+    calls.clear()
+    each = jb.reach_each(small, [8.0, 9.0], progress=lambda *call: calls.append(call))
+    assert len(calls) == int(each.solves.sum()) and calls[-1][0] == len(calls)
+    np.testing.assert_array_equal(calls[-1][1], each.loss[-1])
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda scene: jax.jit(lambda target: jb.reach(scene, target).theta)(8.0),
+        lambda scene: jax.jit(lambda: jb.reach(scene, 8.0).theta)(),
+        lambda scene: jax.jit(lambda scene: jb.reach(scene, 8.0).theta)(scene),
+        lambda scene: jax.jit(lambda low: jb.reach(scene, 8.0, bounds=(low, 1.0)).theta)(0.4),
+        lambda scene: jax.jit(jax.grad(lambda target: jb.reach(scene, target).theta[0]))(8.0),
+        lambda scene: jax.vmap(lambda target: jb.reach(scene, target).theta)(jnp.array([8.0, 9.0])),
+        lambda scene: jax.lax.map(lambda target: jb.reach(scene, target).theta, jnp.array([8.0, 9.0])),
+        lambda scene: jax.jit(lambda targets: jb.reach_each(scene, targets).theta)(jnp.array([8.0, 9.0])),
+    ],
+)
+def test_reach_cannot_be_traced(small, call):
+    with pytest.raises(ValueError, match=r"reach and reach_each run on the host: call them outside jit.*jax\.grad"):
+        call(small)
 
 
 # --------------------------------------------------------------------------------------- least effort

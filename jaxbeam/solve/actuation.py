@@ -1,0 +1,53 @@
+"""Where the way to an equilibrium begins, as data, and the scenes on that way."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.scene.scene import Scene, command, commands_of, partway, rest_commands
+
+
+class Origin(NamedTuple):
+    """A state of the same scene under other commands, from which its equilibrium is approached.
+
+    commands: `(m,)` of that state.
+    loaded: `()` the share of the loads that acts on it.
+    x: `(n, d)` its positions.
+    ahead: `(n, d)` how far the equilibrium is predicted to lie from it.
+    known: `()` int32, 1 where there is such a prediction, else 0.
+    first: `(n, d)` where Newton's method starts, before `ahead` is added.
+    """
+
+    commands: Any
+    loaded: Any
+    x: Any
+    ahead: Any
+    known: Any
+    first: Any
+
+
+def from_rest(scene: Scene, x: Any = None) -> Origin:
+    """The origin without any actuation or load. The first attempt starts at `x`, by default at rest.
+
+    It is made of NumPy's arrays: arithmetic with JAX would compile a program for each shape.
+    """
+    rest = scene.mesh.nodes
+    none = np.zeros(rest.shape, rest.dtype)
+    return Origin(rest_commands(scene), none[0, 0], rest, none, np.int32(0), rest if x is None else x)
+
+
+def from_neighbour(scene: Scene, x: Any, ahead: Any) -> Origin:
+    """The origin in the equilibrium `x` of a `scene`, with a prediction `ahead` of it."""
+    return Origin(commands_of(scene), np.ones((), scene.mesh.nodes.dtype), x, ahead, np.int32(1), x)
+
+
+def scene_between(origin: Origin, scene: Scene, s: jax.Array) -> Scene:
+    """The scene at the share `s` of the way from the origin, 0, to the scene itself, 1."""
+    commands = (1 - s) * origin.commands + s * commands_of(scene)
+    between = command(partway(scene, (1 - s) * origin.loaded + s), commands)
+    # At the end it is the scene to the last bit. What no command changes is the same array in both.
+    return jax.tree.map(lambda own, other: own if own is other else jnp.where(s == 1, own, other), scene, between)

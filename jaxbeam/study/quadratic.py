@@ -1,0 +1,107 @@
+"""The quadratic program of one step of a search, on the host.
+
+Of all steps `s` within a box, find the one of least effort that brings the linearised measure to its target:
+
+    minimise  1/2 s^T A s + (theta - 1)^T s + |slope s + miss|^2 / (2 soft)
+
+The last term is so steep that it is a constraint where that can be met. Its quasi-definite system (Vanderbei 1995) has
+a solution also where it cannot, and where the slope vanishes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+class Program(NamedTuple):
+    """What a step is planned by.
+
+    theta: `(m,)` commands. miss: `(p,)` measure minus target. slope: `(p, m)`. bend: `(p, m, m)`.
+    held: `(m,)` the bounds that held at the last step, -1, 0 or 1. low, high: `(m,)` box of the step.
+    soft: `()` how soft the constraint is, in the unit of a squared slope.
+    """
+
+    theta: np.ndarray
+    miss: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    held: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    soft: float
+
+
+def softness(scale: float) -> float:
+    """`soft` for the largest squared norm of a slope that was seen."""
+    return EPS**0.75 * (scale if scale > 0 else 1.0)
+
+
+def best_step(program: Program) -> tuple[np.ndarray, np.ndarray]:
+    """The step `(m,)` and the sides of its box that hold `(m,)`: -1 for the lower one, 1 for the upper, else 0.
+
+    `A` is the Hessian of a Lagrangian. Its multipliers are those that balance the effort of the free commands; if the
+    step that follows from them does not even halve the miss, those of a target that stays out of reach.
+    """
+    theta, miss, slope, soft = program.theta, program.miss, program.slope, program.soft
+    free = np.where(program.held == 0, slope, 0)
+    price = np.linalg.solve(free @ free.T + soft * np.eye(miss.size), free @ (1 - theta))
+    curvature = np.tensordot(price, program.bend, 1)
+    steepness = 10 * np.linalg.norm(curvature) / max(np.sum(slope**2), soft)
+    step, held = _step_in_box(program, curvature, steepness)
+    if np.linalg.norm(slope @ step + miss) <= 0.5 * np.linalg.norm(miss):
+        return step, held
+    return _step_in_box(program, np.tensordot(miss / soft, program.bend, 1), 1 / soft)
+
+
+def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step, and the sides that hold, for a `curvature` `(m, m)` beside that of the effort.
+
+    An active set: sides that are overstepped are taken up, the worst first, and those that would have to pull are let
+    go.
+    """
+    m, p = program.theta.size, program.miss.size
+    low, high = program.low, program.high
+    matrix = np.block(
+        [[_convex(program, curvature, weight), program.slope.T], [program.slope, -program.soft * np.eye(p)]]
+    )
+    rhs = np.append(1 - program.theta, -program.miss)
+
+    def solve(held: np.ndarray) -> np.ndarray:
+        """Step and multipliers where the sides that hold are equations."""
+        rows, right, at = matrix.copy(), rhs.copy(), np.flatnonzero(held)
+        rows[at] = np.eye(m + p)[at]
+        right[at] = np.where(held < 0, low, high)[at]
+        return np.linalg.solve(rows, right)
+
+    held = np.zeros(m, np.int32)
+    for _ in range(6 * m + 6):
+        both = solve(held)
+        step = both[:m]
+        over = np.where(held == 0, np.maximum(step - high, low - step), 0)
+        # What the side has to push with: negative where it would have to pull.
+        push = np.where(held == 0, 0, -held * (matrix[:m] @ both - rhs[:m]))
+        worst, wrong = np.argmax(over), np.argmin(push)
+        if over[worst] > 16 * EPS:
+            held[worst] = 1 if step[worst] > high[worst] else -1
+        elif push[wrong] < -16 * EPS * (np.abs(matrix[wrong]) @ np.abs(both) + 1):
+            held[wrong] = 0
+        else:
+            break
+    step = np.clip(solve(held)[:m], low, high)
+    return np.where(held == 0, step, np.where(held < 0, low, high)), held
+
+
+def _convex(program: Program, curvature: np.ndarray, weight: float) -> np.ndarray:
+    """`A` `(m, m)`: the curvature and that of the effort, made convex.
+
+    What must be convex is their sum with `weight` times the squared slope, over the commands that no bound held last:
+    the target takes care of the rest.
+    """
+    free = (program.held == 0)[:, None] & (program.held == 0)
+    square = weight * np.where(free, program.slope.T @ program.slope, 0)
+    values, vectors = np.linalg.eigh(np.eye(program.theta.size) + np.where(free, curvature, 0) + square)
+    return (vectors * np.maximum(np.abs(values), 0.01)) @ vectors.T - square
