@@ -162,16 +162,29 @@ def command(scene: Scene, commands: Numbers) -> Scene:
     """
     check_scene(scene)
     values = checks.shaped("ratios", commands, ((command_count(scene),),), "one for each tendon")
+    check_commands("ratios", scene, values)
     terms, start = [], 0
     for term in scene.terms:
         if term.kind.rest_command is not None:
             stop = start + term.nodes.shape[0]
-            # `is_valid` looks at traced ones: commands are parameters.
-            if is_concrete(values):
-                checks.inside("ratios", values[start:stop], term.kind.commands, why=term.kind.command_hint)
             term, start = replace(term, params=term.kind.command(term.params, values[start:stop])), stop
         terms.append(term)
     return replace(scene, terms=tuple(terms))
+
+
+def check_commands(name: str, scene: Scene, values: Any) -> None:
+    """Refuse concrete commands `(..., m)` that are out of the range of what they command.
+
+    Traced ones are looked at by `is_valid`: commands are parameters.
+    """
+    if not is_concrete(values):
+        return
+    start, several = 0, len(commanded_terms(scene)) > 1
+    for term in commanded_terms(scene):
+        stop = start + term.nodes.shape[0]
+        which = f"{name}[{start}:{stop}]" if several else name
+        checks.inside(which, values[..., start:stop], term.kind.commands, why=term.kind.command_hint)
+        start = stop
 
 
 def commanded_terms(scene: Scene) -> list[Term]:

@@ -28,6 +28,7 @@ from jaxbeam.scene.scene import (
     energy,
     evaluate,
     placed,
+    rest_commands,
     smallest_jacobian,
     stencil_hessians,
     worst_element,
@@ -146,13 +147,13 @@ def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any
 
 
 @custom_derivative
-def _sane(ratios: jax.Array, good: jax.Array) -> jax.Array:
-    """The command of a good row; ratio 1 in place of a bad one, which may be 0 or NaN. Derivatives pass through.
+def _sane(commands: jax.Array, rest: jax.Array, good: jax.Array) -> jax.Array:
+    """The command of a good row; that at rest in place of a bad one, which may be NaN. Derivatives pass through.
 
     What nobody looks at has cotangent zero; times the slope of a bad command that would still be NaN, and spread
     from one row to the parameters that all rows share.
     """
-    return jnp.where(good, ratios, 1)
+    return jnp.where(good, commands, rest)
 
 
 @_sane.defjvp
@@ -171,7 +172,8 @@ def differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: So
     def one(row_and_solution: tuple[jax.Array, Solution]) -> Solution:
         ratios, solution = row_and_solution
         good = solution.status == 0
-        moved = differentiable(command(scene, _sane(ratios, good)), layout, solution, None, solver)
+        commanded = command(scene, _sane(ratios, rest_commands(scene), good))
+        moved = differentiable(commanded, layout, solution, None, solver)
         return replace(moved, ratios=ratios, energy=jnp.where(good, moved.energy, solution.energy))
 
     return lax.map(one, (rows, found))

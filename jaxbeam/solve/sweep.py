@@ -27,7 +27,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
-from jaxbeam.scene.scene import Scene, command, energy, partway
+from jaxbeam.scene.scene import Scene, check_commands, command, energy, partway, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
@@ -86,13 +86,11 @@ def sweep(
     shape = values.shape
     if len(shape) != 2 or shape[0] == 0:
         raise ValueError(f"ratios: expected shape (B, m), a row for each command, got {shape}")
-    # Traced ratios are checked by `is_valid`, and flagged.
-    if is_concrete(values):
-        checks.inside("ratios", values, checks.POSITIVE)
     if progress is not None:
         checks.function("progress", progress, "(solved, all)")
     check_held(scene)
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
+    check_commands("ratios", scene, values)
     rows = to_device(values, scene.mesh.nodes.dtype)
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     size = min(CHUNK, max(1, MEMORY // (scene.mesh.nodes.size * (1 + shape[1]))))
@@ -158,7 +156,8 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         The solutions, with leading axis `C`; zeros after the first `count`.
     """
     size = len(rows)
-    order = jnp.argsort(jnp.sum((rows - 1) ** 2, axis=1) + jnp.where(jnp.arange(size) < count, 0, jnp.inf))
+    distance = jnp.sum((rows - rest_commands(scene)) ** 2, axis=1)
+    order = jnp.argsort(distance + jnp.where(jnp.arange(size) < count, 0, jnp.inf))
     chunk = _at_rest(scene, rows)
     zeros = zeros_like_result(lambda: _continue(scene, layout, chunk, order[0], chunk.previous[0], solver))
 
@@ -188,7 +187,7 @@ def _at_rest(scene: Scene, rows: jax.Array) -> Chunk:
     rest = scene.mesh.nodes
     no, zeros = jnp.zeros(size + 1, bool), jnp.zeros((size + 1, *rest.shape), rest.dtype)
     return Chunk(
-        ratios=jnp.concatenate([rows, jnp.ones((1, m), rows.dtype)]),
+        ratios=jnp.concatenate([rows, rest_commands(scene)[None]]),
         loaded=jnp.ones(size + 1, rest.dtype).at[-1].set(0),
         x=zeros.at[-1].set(rest),
         tangent=jnp.zeros((size + 1, m, *rest.shape), rest.dtype),
@@ -281,7 +280,8 @@ def _in_one_program(scene: Scene, layout: Layout, rows: jax.Array, size: int, so
     """The equilibria of traced commands `rows` `(B, m)`, in chunks of `size` consecutive ones."""
     count = len(rows)
     chunks = -(-count // size)
-    padded = jnp.concatenate([rows, jnp.ones((chunks * size - count, rows.shape[1]), rows.dtype)])
+    spare = np.tile(rest_commands(scene), (chunks * size - count, 1))
+    padded = jnp.concatenate([rows, spare])
     counts = jnp.minimum(size, count - size * jnp.arange(chunks))
     parts = lax.map(lambda part: solve_chunk(scene, layout, *part, solver), (padded.reshape(chunks, size, -1), counts))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], parts)
@@ -322,7 +322,7 @@ def _on_all_cores(
     jobs = [mine[k : k + len(devices)] for k in range(0, len(mine), len(devices))]
 
     def solve(job: list[np.ndarray]) -> list[Solution]:
-        chunks, counts = np.ones((len(devices), size, rows.shape[1]), rows.dtype), np.zeros(len(devices), np.int32)
+        chunks, counts = np.tile(rest_commands(scene), (len(devices), size, 1)), np.zeros(len(devices), np.int32)
         for k, part in enumerate(job):
             chunks[k, : len(part)], counts[k] = rows[part], len(part)
         found = jax.device_get(_on_devices(scene, layout, chunks, counts, devices, solver))

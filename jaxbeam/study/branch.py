@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.scene.overlap import crossing
-from jaxbeam.scene.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
+from jaxbeam.scene.scene import Scene, command, evaluate, extent, rest_commands, smallest_jacobian, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_asked, topology
 from jaxbeam.solve.residual import force_round_off, relative_residual, row_magnitudes
@@ -109,7 +109,9 @@ def trace_branch(
     solver: Newton = Newton(),
     progress: Callable[[int, float], None] | None = None,
 ) -> Branch:
-    """Follow one branch of equilibria of the commands `1 + s (ratios - 1)`, through its folds.
+    """Follow one branch of equilibria of the commands `rest + s (ratios - rest)`, through its folds.
+
+    At rest the ratio of a tendon is 1.
 
     It runs on the host, one jitted step after the other, and does not jump where a beam would.
 
@@ -160,8 +162,14 @@ def _check_way(
     return (low, high), parameter, step
 
 
+def on_the_way(scene: Scene, end: jax.Array, s: Any) -> Any:
+    """The commands `rest + s (end - rest)`."""
+    rest = rest_commands(scene)
+    return rest + s * (end - rest)
+
+
 class Path(NamedTuple):
-    """The scenes whose equilibria are traced: the commands `1 + s (end - 1)`."""
+    """The scenes whose equilibria are traced: the commands `rest + s (end - rest)`."""
 
     scene: Scene
     end: jax.Array
@@ -169,7 +177,11 @@ class Path(NamedTuple):
     solver: Newton
 
     def scene_at(self, s: jax.Array | float) -> Scene:
-        return command(self.scene, 1 + s * (self.end - 1))
+        return command(self.scene, self.commands_at(s))
+
+    def commands_at(self, s: Any) -> Any:
+        """The commands `(..., m)` at parameters `s` `()` or `(P, 1)`."""
+        return on_the_way(self.scene, self.end, s)
 
     def advance(self, here: Point, length: float) -> Point:
         """The point of the branch at `length` along the tangent of `here`."""
@@ -224,7 +236,7 @@ def _branch(path: Path, points: list[Point], critical: list[Critical], ended: st
     s, x = stack("s"), stack("x")
     return Branch(
         parameter=s,
-        ratios=1 + s[:, None] * (np.asarray(path.end) - 1),
+        ratios=np.asarray(path.commands_at(s[:, None])),
         x=x,
         negative=stack("negative"),
         residual=stack("residual"),
@@ -260,7 +272,7 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
 
     def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Steps to balance at fixed s, and with s; residual and inertia."""
-        scene_at = lambda s: command(scene, 1 + s * (end - 1))
+        scene_at = lambda s: command(scene, on_the_way(scene, end, s))
         at = evaluate(scene_at(s), x)
         hessians = stencil_hessians(scene_at(s), x)
         storage = assemble(layout, hessians)
@@ -327,6 +339,6 @@ def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Cr
             low, f_low = middle, value
             f_high *= 0.5 if side == -1 else 1.0
             side = -1
-    ratios = np.asarray(1 + point.s * (path.end - 1))
+    ratios = np.asarray(path.commands_at(point.s))
     kind = "fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation"
     return Critical(kind, float(point.s), ratios, point.x, shape, value, after)

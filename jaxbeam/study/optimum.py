@@ -3,7 +3,7 @@
 The search is not differentiated. Its answer `theta` is a stationary point of a Lagrangian over the commands that no
 bound holds, with one multiplier `price` for each component of the measure (Nocedal and Wright 2006, section 12.3):
 
-    reached      L = 1/2 |theta - 1|^2 + price . (measure - target)
+    reached      L = 1/2 |theta - rest|^2 + price . (measure - target)
     unreachable  L = 1/2 |measure - target|^2
 
 so by the implicit function theorem `z = (theta, price)` moves by `H dz = -d(grad L)`, with `H` the Hessian of `L` in
@@ -25,7 +25,7 @@ from jax import lax
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import pytree, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble
-from jaxbeam.scene.scene import Scene, command, stencil_hessians
+from jaxbeam.scene.scene import Scene, command, rest_commands, stencil_hessians
 from jaxbeam.solve.equilibrium import differentiable
 from jaxbeam.solve.implicit import follow_scene
 from jaxbeam.solve.newton import Newton
@@ -89,7 +89,7 @@ def follow_optimum(
     slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
     slope = jnp.where(answer.held == 0, slope, 0)
     gram = slope @ slope.T
-    price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ (1 - answer.theta))
+    price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ (rest_commands(problem.scene) - answer.theta))
     return answer.theta, jnp.where(answer.reached & answer.trusted, price, 0)
 
 
@@ -118,7 +118,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     def lagrangian(problem: Problem, target: jax.Array, z: jax.Array) -> jax.Array:
         theta, price = z[:m], z[m:]
         miss = _outcome(measure, linear, problem, theta, answer) - target
-        effort = 0.5 * jnp.sum((1 - theta) ** 2) + price @ miss
+        effort = 0.5 * jnp.sum((rest_commands(problem.scene) - theta) ** 2) + price @ miss
         return jnp.where(answer.reached, effort, 0.5 * jnp.sum(miss**2) + 0.5 * jnp.sum(price**2))
 
     slope = jax.grad(lagrangian, argnums=2)

@@ -2,7 +2,7 @@
 
 Of all steps `s` within a box, find the one of least effort that brings the linearised measure to its target:
 
-    minimise  1/2 s^T A s + (theta - 1)^T s + |slope s + miss|^2 / (2 soft)
+    minimise  1/2 s^T A s + (theta - rest)^T s + |slope s + miss|^2 / (2 soft)
 
 The last term is so steep that it is a constraint where that can be met. Its quasi-definite system (Vanderbei 1995) has
 a solution also where it cannot, and where the slope vanishes.
@@ -20,12 +20,16 @@ EPS = float(np.finfo(np.float64).eps)
 class Program(NamedTuple):
     """What a step is planned by.
 
-    theta: `(m,)` commands. miss: `(p,)` measure minus target. slope: `(p, m)`. bend: `(p, m, m)`.
+    theta: `(m,)` commands.
+    rest: `(m,)` commands of no effort.
+    miss: `(p,)` measure minus target.
+    slope: `(p, m)` first and bend: `(p, m, m)` second derivatives of the measure.
     held: `(m,)` the bounds that held at the last step, -1, 0 or 1. low, high: `(m,)` box of the step.
     soft: `()` how soft the constraint is, in the unit of a squared slope.
     """
 
     theta: np.ndarray
+    rest: np.ndarray
     miss: np.ndarray
     slope: np.ndarray
     bend: np.ndarray
@@ -48,7 +52,7 @@ def best_step(program: Program) -> tuple[np.ndarray, np.ndarray]:
     """
     theta, miss, slope, soft = program.theta, program.miss, program.slope, program.soft
     free = np.where(program.held == 0, slope, 0)
-    price = np.linalg.solve(free @ free.T + soft * np.eye(miss.size), free @ (1 - theta))
+    price = np.linalg.solve(free @ free.T + soft * np.eye(miss.size), free @ (program.rest - theta))
     curvature = np.tensordot(price, program.bend, 1)
     steepness = 10 * np.linalg.norm(curvature) / max(np.sum(slope**2), soft)
     step, held = _step_in_box(program, curvature, steepness)
@@ -68,7 +72,7 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
     matrix = np.block(
         [[_convex(program, curvature, weight), program.slope.T], [program.slope, -program.soft * np.eye(p)]]
     )
-    rhs = np.append(1 - program.theta, -program.miss)
+    rhs = np.append(program.rest - program.theta, -program.miss)
 
     def solve(held: np.ndarray) -> np.ndarray:
         """Step and multipliers where the sides that hold are equations."""

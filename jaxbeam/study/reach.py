@@ -16,7 +16,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import is_outermost, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device
 from jaxbeam.scene.measures import tip_angle
-from jaxbeam.scene.scene import Scene, command_count
+from jaxbeam.scene.scene import Scene, command_count, commanded_terms, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_asked, topology
 from jaxbeam.study.design import Design, DesignStatus, History
@@ -27,13 +27,17 @@ from jaxbeam.study.search import SearchState, Task, Trial, search
 # ------------------------------------------------------------------------------------------------ reach
 
 
+# Bounds of the ratios of tendons, unless others are given.
+RATIOS = (0.4, 1.0)
+
+
 @usual_rules
 def reach(
     scene: Scene,
     target: Numbers,
     measure: Measure = tip_angle,
     *,
-    bounds: tuple[Numbers, Numbers] = (0.4, 1.0),
+    bounds: tuple[Numbers, Numbers] | None = None,
     starts: Numbers | None = None,
     tolerance: float | None = None,
     max_solves: int = 40,
@@ -42,18 +46,18 @@ def reach(
 ) -> Design:
     """Commands within `bounds` at which `measure` of the equilibrium is `target`.
 
-    Of all that reach it, the one of least effort `sum (1 - ratio)^2`; if none does, the one nearest to it. Found by
-    sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact first and second derivatives: each
-    step is a small quadratic program in the commands. The search is local: where a target is reached in several
-    ways, or on several branches, give several `starts`, and the best answer is taken.
+    Of all that reach it, the one of least effort `sum (rest - command)^2`, of tendons `sum (1 - ratio)^2`; if none
+    does, the one nearest to it. Found by sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact
+    first and second derivatives: each step is a small quadratic program in the commands. The search is local: where a
+    target is reached in several ways, or on several branches, give several `starts`, and the best answer is taken.
 
     Args:
         scene: with `m` tendons.
         target: `()` or `(p,)`, what the measure should be.
         measure: `(scene, x)` to `()` or `(p,)`, such as `tip_angle` (degrees), `tip_position` (length), or a
             function of your own at module level. Components are weighed as they are: scale those of different units.
-        bounds: lowest and highest ratio, each `()` or `(m,)`.
-        starts: `(S, m)` commands to start from; by default ratio 1, at rest.
+        bounds: lowest and highest command, each `()` or `(m,)`; by default 0.4 and 1 for ratios of tendons.
+        starts: `(S, m)` commands to start from; by default those at rest, of tendons ratio 1.
         tolerance: largest deviation from the target that counts as reached, in its unit: by default 1e-8, in
             float32 1e-3.
         max_solves: equilibria to solve at most, from each start.
@@ -94,7 +98,7 @@ def reach_each(
     targets: Numbers,
     measure: Measure = tip_angle,
     *,
-    bounds: tuple[Numbers, Numbers] = (0.4, 1.0),
+    bounds: tuple[Numbers, Numbers] | None = None,
     starts: Numbers | None = None,
     tolerance: float | None = None,
     max_solves: int = 40,
@@ -123,7 +127,7 @@ def reach_each(
 
 def _problem(
     scene: Scene,
-    bounds: tuple[Numbers, Numbers],
+    bounds: tuple[Numbers, Numbers] | None,
     starts: Numbers | None,
     tolerance: float | None,
     max_solves: int,
@@ -140,6 +144,10 @@ def _problem(
     if tolerance is None:
         tolerance = 1e-8 if jnp.finfo(dtype).eps < 1e-10 else 1e-3
     tolerance = checks.number("tolerance", tolerance, checks.POSITIVE)
+    rest = rest_commands(scene)
+    if bounds is None and (rest != 1).any():
+        raise ValueError("bounds: only ratios of tendons have default bounds; give the lowest and the highest commands")
+    bounds = RATIOS if bounds is None else bounds
     if not isinstance(bounds, tuple | list) or len(bounds) != 2:
         raise ValueError(f"bounds: expected the lowest and the highest ratio, (low, high), got {bounds!r}")
     ends = []
@@ -150,9 +158,10 @@ def _problem(
         xp = namespace(end)
         ends.append(to_device(xp.broadcast_to(xp.asarray(end, dtype), (count,))))
     low, high = ends
-    if is_concrete(low, high) and not ((np.asarray(low) > 0) & (np.asarray(low) <= np.asarray(high))).all():
+    least = np.concatenate([np.full(len(term.nodes), term.kind.commands.low) for term in commanded_terms(scene)])
+    if is_concrete(low, high) and not ((np.asarray(low) > least) & (np.asarray(low) <= np.asarray(high))).all():
         raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
-    begin = np.ones((1, count)) if starts is None else checks.numbers("starts", starts)
+    begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
     problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))

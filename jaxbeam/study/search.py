@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbeam.core.tree import unlock
 from jaxbeam.linear.layout import Layout
-from jaxbeam.scene.scene import Scene, command
+from jaxbeam.scene.scene import Scene, command, rest_commands
 from jaxbeam.solve.actuation import from_neighbour, from_rest
 from jaxbeam.solve.equilibrium import solve_from
 from jaxbeam.solve.newton import Newton
@@ -58,6 +58,7 @@ class Trial(NamedTuple):
     theta: `(m,)`. miss: `(p,)` measure minus target. slope, bend, drift: as in `Expansion`.
     """
 
+    scene: Scene
     theta: np.ndarray
     solution: Solution
     miss: np.ndarray
@@ -77,7 +78,8 @@ class Trial(NamedTuple):
 
     @property
     def effort(self) -> float:
-        return float(np.sum((1 - self.theta) ** 2))
+        """Sum of the squared distances of the commands from rest."""
+        return float(np.sum((rest_commands(self.scene) - self.theta) ** 2))
 
     @property
     def good(self) -> bool:
@@ -150,7 +152,7 @@ def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
     solution, factor = solve_from(origin, scene, task.layout, task.solver)
     around = expand_measure(task.scene, task.layout, theta, solution.x, factor, task.measure, linear)
     value, slope, bend, drift = (each.astype(float) for each in jax.device_get(around))
-    return Trial(theta.astype(float), solution, value - task.target, slope, bend, drift)
+    return Trial(task.scene, theta.astype(float), solution, value - task.target, slope, bend, drift)
 
 
 def _record(task: Task, state: SearchState, trial: Trial) -> None:
@@ -192,7 +194,8 @@ def _plan(task: Task, state: SearchState) -> None:
     assert here is not None
     room, above = here.theta - task.low, task.high - here.theta
     low, high = np.maximum(-room, -radius), np.minimum(above, radius)
-    program = Program(here.theta, here.miss, here.slope, here.bend, state.held, low, high, softness(state.scale))
+    idle, soft = rest_commands(task.scene), softness(state.scale)
+    program = Program(here.theta, idle, here.miss, here.slope, here.bend, state.held, low, high, soft)
     step, held = best_step(program)
     # A command held by the radius alone is not held by a bound.
     state.held = np.where(np.where(held < 0, room <= radius, above <= radius), held, 0)

@@ -195,3 +195,33 @@ def test_a_traced_transition_out_of_range_is_invalid():
     term = cabled().terms[1]
     broken = replace(term, params=replace(term.params, transition=jnp.full(2, -1.0)))
     assert not bool(is_valid(replace(BEAM, terms=(BEAM.terms[0], broken))))
+
+
+# --------------------------------------------------------------------------- studies speak of any command
+
+
+def tip(scene, x):
+    return jb.tip_angle(scene, x)
+
+
+def test_reach_finds_a_tension():
+    """The wire is pulled as little as bends the beam by half a degree. Bounds of a tension must be given."""
+    with pytest.raises(ValueError, match="bounds: only ratios"):
+        jb.reach(SCENE, 0.5, tip)
+    found = jb.reach(SCENE, 0.5, tip, bounds=([-100.0, 1.0], [100.0, 1.0]))
+    assert int(found.status) == jb.DesignStatus.REACHED
+    solved = jb.command(SCENE, found.theta)
+    np.testing.assert_allclose(tip(solved, jb.equilibrium(solved).x), 0.5, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_sweep_and_branch_of_a_tension():
+    rows = np.array([[-20.0, 1.0], [0.0, 0.9], [30.0, 1.0]])
+    batch = jb.check(jb.sweep(SCENE, rows))
+    for row, x in zip(rows, batch.x, strict=True):
+        np.testing.assert_allclose(x, jb.equilibrium(jb.command(SCENE, row)).x, atol=1e-9)
+    with pytest.raises(ValueError, match=r"ratios\[1:2\]: expected positive"):
+        jb.sweep(SCENE, [[-20.0, -1.0]])
+    branch = jb.trace_branch(SCENE, [30.0, 1.0], step=0.5)
+    np.testing.assert_allclose(branch.ratios[0], [0, 1])
+    np.testing.assert_allclose(branch.ratios[:, 0], 30 * branch.parameter)
