@@ -25,7 +25,7 @@ from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, command, evaluate, extent, smallest_jacobian, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.residual import force_round_off, relative_residual, row_magnitudes
 from jaxbeam.solve.solution import Status, check
 from jaxbeam.study.stability import lowest_mode
@@ -132,7 +132,7 @@ def trace_branch(
         ValueError: as `command` does, or if an argument is out of its range.
         EquilibriumError: if there is no equilibrium at the start.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     if isinstance(direction, bool) or direction not in (1, -1):
         raise ValueError(f"direction: expected 1 or -1, got {direction!r}")
     step, parameter = checks.setting("step", step, checks.POSITIVE), checks.setting("parameter", parameter)

@@ -16,7 +16,7 @@ from jaxbeam.core.tree import Numbers, is_concrete, replace
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene, tendon_count
 from jaxbeam.scene.supports import check_held
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.study.design import Design, DesignStatus
 from jaxbeam.study.optimum import Answer, move_answer
 from jaxbeam.study.search import Measure, Problem, Stand, effects, search
@@ -120,7 +120,7 @@ def _problem(
     solver: Newton,
 ) -> tuple[Problem, jax.Array]:
     """The checked problem, and the commands `(S, m)` to start from."""
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.count("max_solves", max_solves, 1)
     check_held(scene)
     dtype = scene.mesh.nodes.dtype

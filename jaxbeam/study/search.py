@@ -19,9 +19,9 @@ from jaxbeam.core.tree import pytree, replace, unlock
 from jaxbeam.linear.layout import Layout
 from jaxbeam.scene.scene import Scene, command
 from jaxbeam.solve.continuation import follow
-from jaxbeam.solve.implicit import follow_scene
+from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton
-from jaxbeam.solve.predictor import begin
+from jaxbeam.solve.predictor import start_trail
 from jaxbeam.solve.solution import Solution
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
@@ -89,7 +89,7 @@ def approach(
     that it is traced once however often it is used.
     """
     way = lambda s: command(scene, (1 - s) * before + s * theta)
-    path, factor, _ = follow(way, layout, begin(x, ahead), jnp.ones(1, x.dtype), solver)
+    path, factor, _ = follow(way, layout, start_trail(x, ahead), jnp.ones(1, x.dtype), solver)
     return jax.tree.map(lambda leaf: leaf[0], path), factor
 
 
@@ -120,7 +120,9 @@ def search(
 
         def outcome(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
             scene = command(problem.scene, theta)
-            x = follow_scene(solver.linear, unlock(scene), problem.layout, solution.x, factor, solution.status == 0)
+            x = attach_derivative(
+                solver.linear, unlock(scene), problem.layout, solution.x, factor, solution.status == 0
+            )
             return jnp.ravel(measure(scene, x)) - goal, x
 
         slopes = jax.jacfwd(outcome)
