@@ -89,7 +89,7 @@ class Scene:
 
     def __repr__(self) -> str:
         # JAX builds trees of the same structure from anything.
-        if not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.fixed]):
+        if not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.mesh.nodes]):
             return "Scene(a tree of other values)"
         terms = ", ".join(f"{len(term.nodes)} x {term.kind.name}" for term in self.terms)
         free = f"{int((~self.fixed).sum())} of {self.fixed.size} coordinates free"

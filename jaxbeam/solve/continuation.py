@@ -3,8 +3,8 @@
 The path has a parameter `s`; an equilibrium is asked for at each of a few targets. A single equilibrium is a path with
 one target. All solves share one Newton loop in the compiled program, whatever happens on the way.
 
-An *attempt* is one Newton solve, from a predicted start. A state it converges to is *accepted*, unless it is a saddle
-to leave or may be reached from too far (`_judge`). An attempt that fails is followed by one with half the increment.
+An *attempt* is one Newton solve from a predicted start. Its state is *accepted* if it converged, unless it is a saddle
+or the increment may have been too long (see `_judge`). After an attempt that fails the increment is halved.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, worst_element
 from jaxbeam.solve import newton
 from jaxbeam.solve.newton import INACCURATE, Newton
-from jaxbeam.solve.predictor import Trail, ahead, extend
+from jaxbeam.solve.predictor import Trail, extend, predict
 from jaxbeam.solve.report import PackedReport, Report, pack, unpack, zeros
 from jaxbeam.solve.solution import Solution, Status
 from jaxbeam.solve.stiffness import zero_factor
@@ -370,7 +370,7 @@ def _next_start(
     start = jnp.where(leave, attempt.x, jnp.where(verdict.give_up, accepted, trail.x[0]))
     scale = ESCAPE * extent(scene) / jnp.max(jnp.abs(attempt.response))
     escape = jnp.where(jnp.isfinite(scale), scale * attempt.response, 0)
-    predicted = jnp.where(verdict.give_up, 0, ahead(trail, parameter))
+    predicted = jnp.where(verdict.give_up, 0, predict(trail, parameter))
     return start, jnp.where(leave, escape, predicted)
 
 

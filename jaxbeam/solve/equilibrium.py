@@ -36,9 +36,9 @@ from jaxbeam.scene.scene import (
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.actuation import Origin, from_rest, scene_between
 from jaxbeam.solve.continuation import follow
-from jaxbeam.solve.implicit import follow_scene, follow_zero, linear_gradient
-from jaxbeam.solve.newton import Newton, check_asked, check_linear, topology
-from jaxbeam.solve.predictor import begin
+from jaxbeam.solve.implicit import attach_derivative, attach_derivative_of_root, linear_gradient
+from jaxbeam.solve.newton import Newton, check_linear, check_scene_and_solver, topology
+from jaxbeam.solve.predictor import start_trail
 from jaxbeam.solve.solution import Solution
 
 
@@ -65,7 +65,7 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
         ValueError: if `x0` has another shape, or is concrete and not finite or inverts an element, or if a
             piece of the mesh is not held and moves as a rigid body.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     check_held(scene)
     layout = solver.linear.layout(topology(scene))
     open_scene, x = unlock(scene), start(scene, x0)
@@ -120,7 +120,7 @@ def _moving_response(
     """The linear response `x` as a function of the scene."""
     # NaN is added at the end: in a slope it would spread to what does not look at it.
     finite = jnp.where(stable, x, lax.stop_gradient(scene.mesh.nodes))
-    moving = follow_zero(linear, linear_gradient, scene, layout, finite, factor, stable)
+    moving = attach_derivative_of_root(linear, linear_gradient, scene, layout, finite, factor, stable)
     return moving + jnp.where(stable | scene.fixed, 0, jnp.nan).astype(x.dtype)
 
 
@@ -130,7 +130,7 @@ def solve_from(origin: Origin, scene: Scene, layout: Layout, solver: Newton) -> 
 
     Where the origin lies is data: `equilibrium` and the searches of `reach` run the same compiled program.
     """
-    trail = begin(origin.x, origin.ahead)._replace(depth=origin.known)
+    trail = start_trail(origin.x, origin.ahead)._replace(depth=origin.known)
     way = lambda s: scene_between(origin, scene, s)
     targets = jnp.ones(1, scene.mesh.nodes.dtype)
     path, factor, _ = follow(way, layout, trail, targets, solver, origin.first, origin.ahead)
@@ -140,7 +140,7 @@ def solve_from(origin: Origin, scene: Scene, layout: Layout, solver: Newton) -> 
 @partial(jax.jit, static_argnames="solver")
 def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any, solver: Newton) -> Solution:
     """The solution as a function of the scene: `x`, `energy`, `smallest_jacobian` and `ratios` move with it."""
-    x = follow_scene(solver.linear, scene, layout, solution.x, factor, solution.status == 0)
+    x = attach_derivative(solver.linear, scene, layout, solution.x, factor, solution.status == 0)
     return replace(
         solution, x=x, energy=energy(scene, x), smallest_jacobian=smallest_jacobian(scene, x), ratios=commands_of(scene)
     )

@@ -60,7 +60,7 @@ def linear_gradient(scene: Scene, x: jax.Array) -> jax.Array:
     return force + change
 
 
-def follow_scene(
+def attach_derivative(
     linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
 ) -> jax.Array:
     """`x` itself, with the derivative of the equilibrium attached.
@@ -73,11 +73,11 @@ def follow_scene(
         factor: of the true stiffness at `x`; None to factorise it when a derivative is asked for.
         trusted: `()` whether `x` is an equilibrium with a positive definite stiffness. If not, the derivative is NaN.
     """
-    return follow_zero(linear, energy_gradient, scene, layout, x, factor, trusted)
+    return attach_derivative_of_root(linear, energy_gradient, scene, layout, x, factor, trusted)
 
 
 @partial(custom_derivative, static=2)
-def follow_zero(
+def attach_derivative_of_root(
     linear: LinearSolver,
     gradient: Gradient,
     scene: Scene,
@@ -91,22 +91,22 @@ def follow_zero(
     Args:
         linear: the linear solver.
         gradient: `energy_gradient` or `linear_gradient`.
-        scene: as of `follow_scene`.
-        layout: as of `follow_scene`.
+        scene: as of `attach_derivative`.
+        layout: as of `attach_derivative`.
         x: `(n, d)` positions at which the gradient is zero on free coordinates.
         factor: of the derivative of `gradient` in `x`. None is allowed with `energy_gradient` only.
-        trusted: as of `follow_scene`.
+        trusted: as of `attach_derivative`.
     """
     return x
 
 
-@follow_zero.defjvp
-def _follow_zero_jvp(
+@attach_derivative_of_root.defjvp
+def _attach_derivative_jvp(
     linear: LinearSolver, gradient: Gradient, primals: Any, tangents: Any
 ) -> tuple[jax.Array, jax.Array]:
     scene, layout, found, factor, trusted = primals
     scene_dot = tangents[0]
-    x = follow_zero(linear, gradient, *primals)
+    x = attach_derivative_of_root(linear, gradient, *primals)
     # The derivative of a failed solution is NaN. Keep it out of second derivatives that do not depend on it.
     at = jnp.where(trusted, x, found)
     if factor is None:

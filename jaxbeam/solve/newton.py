@@ -86,7 +86,7 @@ def check_linear(name: str, linear: Any) -> None:
         raise ValueError(f"{name}: expected a linear solver, such as BlockTridiagonal() or Dense(), got {linear!r}")
 
 
-def check_asked(scene: Scene, solver: Newton) -> None:
+def check_scene_and_solver(scene: Scene, solver: Newton) -> None:
     """Refuse what is not a scene to solve, or not a solver."""
     check_scene(scene)
     checks.instance("solver", solver, Newton, "make one with Newton(...)")

@@ -37,7 +37,7 @@ class Trail(NamedTuple):
     depth: jax.Array
 
 
-def begin(x: jax.Array, slope: jax.Array | None = None) -> Trail:
+def start_trail(x: jax.Array, slope: jax.Array | None = None) -> Trail:
     """A trail of one state, at `s = 0`.
 
     Args:
@@ -50,7 +50,7 @@ def begin(x: jax.Array, slope: jax.Array | None = None) -> Trail:
     return Trail(jnp.zeros(STATES, x.dtype), zeros.at[0].set(x), slopes, depth)
 
 
-def ahead(trail: Trail, s: jax.Array) -> jax.Array:
+def predict(trail: Trail, s: jax.Array) -> jax.Array:
     """Predicted displacement `(n, d)` from the newest state to the one at `s`; zero while no slope is known.
 
     It is that of the interpolating polynomial, or along the tangent where these differ by more than `TRUST`.

@@ -15,8 +15,8 @@ from jaxbeam.scene.scene import Scene, command, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
-from jaxbeam.solve.newton import Newton, check_asked, topology
-from jaxbeam.solve.predictor import begin
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
+from jaxbeam.solve.predictor import start_trail
 from jaxbeam.solve.solution import Solution
 
 
@@ -69,7 +69,7 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     Raises:
         ValueError: as `command` and `equilibrium` do, or if `steps` is not a whole number of at least 2.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.count("steps", steps, 2)
     check_held(scene)
     command(scene, ratios)  # checks the ratios
@@ -85,6 +85,6 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
 def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
     targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
     rest = rest_commands(scene)
-    return follow(lambda s: command(scene, (1 - s) * rest + s * end), layout, begin(scene.mesh.nodes), targets, solver)[
-        0
-    ]
+    return follow(
+        lambda s: command(scene, (1 - s) * rest + s * end), layout, start_trail(scene.mesh.nodes), targets, solver
+    )[0]

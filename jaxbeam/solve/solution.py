@@ -96,6 +96,18 @@ class Solution:
     reached: jax.Array
     status: jax.Array
 
+    def __repr__(self) -> str:
+        # JAX builds trees of the same structure from anything.
+        known = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.status])
+        if not known or not is_concrete(self.status):
+            return f"Solution({'traced' if known else 'a tree of other values'})"
+        flags = [Status(int(flag)) for flag in np.ravel(self.status)]
+        if np.ndim(self.status) == 0:
+            return f"Solution({flags[0].name}; {_describe(self, 0)})"
+        counts = {flag.name: flags.count(flag) for flag in sorted(set(flags))}
+        words = ", ".join(f"{count} {name}" for name, count in counts.items())
+        return f"Solution({len(flags)} states: {words}; {int(np.sum(self.steps))} Newton steps)"
+
 
 def check(solution: Solution) -> Solution:
     """Return the solution if its status is `OK`, in every member of a batch.

@@ -31,8 +31,8 @@ from jaxbeam.scene.scene import Scene, check_commands, command, energy, partway,
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
-from jaxbeam.solve.newton import Newton, check_asked, topology
-from jaxbeam.solve.predictor import STATES, Trail, ahead
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
+from jaxbeam.solve.predictor import STATES, Trail, predict
 from jaxbeam.solve.solution import Solution, Status
 
 # The most commands in a chunk.
@@ -81,7 +81,7 @@ def sweep(
     Raises:
         ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     values = checks.shaped("ratios", ratios, None)
     shape = values.shape
     if len(shape) != 2 or shape[0] == 0:
@@ -227,7 +227,7 @@ def _continue(
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * start + s * ratios)
     trail = _trail(chunk, parent, ratios)
     one = jnp.ones((), chunk.x.dtype)
-    path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=ahead(trail, one))
+    path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=predict(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
     gradient = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
     load = lambda direction: gather(layout, jax.jvp(gradient, (ratios,), (direction,))[1])

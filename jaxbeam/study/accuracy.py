@@ -33,7 +33,7 @@ from jaxbeam.mesh.surface import surface
 from jaxbeam.physics.energy import NotRefinable, Term
 from jaxbeam.scene.scene import Scene, check_scene, evaluate, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
@@ -107,7 +107,7 @@ def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: N
     Raises:
         ValueError: if the scene is traced or has no triangles, or the measure returns anything but a scalar.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.instance("solution", solution, Solution, "give what equilibrium(scene) returned")
     checks.function("measure", measure, "(scene, x) -> scalar")
     return _estimate(scene, solution, measure, solver)[0]
@@ -131,7 +131,7 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
     Raises:
         ValueError: if the tolerance is not positive and finite, or as `estimate_error` does.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.function("measure", measure, "(scene, x) -> scalar")
     tolerance = checks.setting("tolerance", tolerance, checks.POSITIVE, "it is in the unit of the measure")
     checks.count("most", most, 1)

@@ -25,7 +25,7 @@ from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, command, evaluate, extent, rest_commands, smallest_jacobian, stencil_hessians
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.residual import force_round_off, relative_residual, row_magnitudes
 from jaxbeam.solve.solution import Status, check
 from jaxbeam.study.stability import lowest_mode
@@ -134,7 +134,7 @@ def trace_branch(
         ValueError: as `command` does, or if an argument is out of its range.
         EquilibriumError: if there is no equilibrium at the start.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     interval, parameter, step = _check_way(direction, interval, parameter, step)
     checks.count("max_points", max_points, 1)
     dtype = scene.mesh.nodes.dtype

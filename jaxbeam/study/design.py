@@ -6,8 +6,9 @@ import enum
 from typing import Any
 
 import jax
+import numpy as np
 
-from jaxbeam.core.tree import pytree
+from jaxbeam.core.tree import is_concrete, pytree
 from jaxbeam.solve.solution import Solution
 
 
@@ -54,3 +55,16 @@ class Design:
     solves: jax.Array
     history: History
     status: jax.Array
+
+    def __repr__(self) -> str:
+        known = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.status])
+        if not known or not is_concrete(self.status):
+            return f"Design({'traced' if known else 'a tree of other values'})"
+        if np.ndim(self.status):
+            flags = [DesignStatus(int(flag)).name for flag in self.status]
+            words = ", ".join(f"{flags.count(name)} {name}" for name in dict.fromkeys(flags))
+            return f"Design({len(flags)} targets: {words}; {int(np.sum(self.solves))} solves)"
+        count = sum(leaf.size for leaf in jax.tree.leaves(self.theta))
+        theta = jax.tree.map(lambda leaf: leaf.tolist(), self.theta) if count <= 8 else f"of {count} numbers"
+        status = DesignStatus(int(self.status)).name
+        return f"Design({status}; value {self.value.tolist()}, theta {theta}, {int(self.solves)} solves)"

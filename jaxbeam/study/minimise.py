@@ -17,7 +17,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.scene.scene import Scene
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_asked
+from jaxbeam.solve.newton import Newton, check_scene_and_solver
 from jaxbeam.solve.solution import Solution
 from jaxbeam.study.design import Design, DesignStatus, History
 
@@ -70,7 +70,7 @@ def minimise(
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise ValueError(f"theta0: expected a pytree of float arrays, got {theta0!r}")
     first = design(theta)
-    check_asked(first, solver)
+    check_scene_and_solver(first, solver)
     check_held(first)
     programs = _programs(loss, design, optimiser, solver)
     state = DescentState(theta, first.mesh.nodes, _strong(programs.init(theta)), last=theta)

@@ -27,7 +27,7 @@ from jaxbeam.core.tree import pytree, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble
 from jaxbeam.scene.scene import Scene, command, rest_commands, stencil_hessians
 from jaxbeam.solve.equilibrium import differentiable
-from jaxbeam.solve.implicit import follow_scene
+from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton
 from jaxbeam.solve.solution import Solution
 from jaxbeam.study.expansion import Measure
@@ -96,7 +96,7 @@ def follow_optimum(
 def _outcome(measure: Measure, linear: LinearSolver, problem: Problem, theta: jax.Array, answer: Answer) -> jax.Array:
     """The measure `(p,)` at commands `theta`."""
     scene = command(problem.scene, theta)
-    x = follow_scene(linear, unlock(scene), problem.layout, answer.x, answer.factor, jnp.asarray(True))
+    x = attach_derivative(linear, unlock(scene), problem.layout, answer.x, answer.factor, jnp.asarray(True))
     return jnp.ravel(measure(scene, x))
 
 

@@ -18,7 +18,7 @@ from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_devic
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene, command_count, commanded_terms, rest_commands
 from jaxbeam.scene.supports import check_held
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure
 from jaxbeam.study.optimum import Answer, Problem, move_answer
@@ -134,7 +134,7 @@ def _problem(
     solver: Newton,
 ) -> tuple[Problem, Any]:
     """The checked problem, and the commands `(S, m)` to start from."""
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.count("max_solves", max_solves, 1)
     check_held(scene)
     dtype = scene.mesh.nodes.dtype

@@ -22,7 +22,7 @@ from jaxbeam.core.tree import Numbers, is_concrete, pytree, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand
 from jaxbeam.scene.scene import Scene, placed, stencil_hessians
 from jaxbeam.solve.implicit import energy_gradient
-from jaxbeam.solve.newton import Newton, check_asked, topology
+from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 
 # Subspace iteration: extra vectors beside the wanted ones, and the most turns it may take.
 GUARD = 4
@@ -65,7 +65,7 @@ def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newto
     Raises:
         ValueError: if `count` is not between 1 and the number of free coordinates, or `x` has another shape.
     """
-    check_asked(scene, solver)
+    check_scene_and_solver(scene, solver)
     checks.count("count", count, 1, int(np.sum(~scene.fixed)), "the free coordinates")
     x = placed(scene, x)
     layout = solver.linear.layout(topology(scene))

@@ -499,3 +499,13 @@ def test_new_values_compile_nothing():
         solution = jb.check(jb.equilibrium(changed))
         jb.check(jb.equilibrium(changed, x0=np.asarray(solution.x)))
     assert traces["density"] == before
+
+
+def test_a_solution_prints_as_a_summary(beam, steered, bent_path):
+    _, solution = steered
+    assert repr(solution).startswith("Solution(OK; residual ") and "command [0.4, 1.0])" in repr(solution)
+    assert repr(bent_path).startswith("Solution(28 states: 28 OK; ")
+    assert repr(jax.tree.map(lambda leaf: None, solution)) == "Solution(a tree of other values)"
+    said = []
+    jax.eval_shape(lambda solution: said.append(repr(solution)), solution)
+    assert said == ["Solution(traced)"]

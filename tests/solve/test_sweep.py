@@ -15,7 +15,7 @@ import jaxbeam as jb
 from jaxbeam.mesh.line import straight
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
-from jaxbeam.solve.predictor import ahead, begin, extend
+from jaxbeam.solve.predictor import extend, predict, start_trail
 
 # The package's name `sweep` is the function; its module is found through it.
 module = sys.modules["jaxbeam.solve.sweep"]
@@ -166,10 +166,10 @@ def test_processes_change_nothing(tmp_path):
 def trail_of(curve, at):
     """The trail of a curve `s -> (1, 2)` at the parameters `at`."""
     slope = jax.jacfwd(curve)
-    trail = begin(curve(at[0]), slope(at[0]))
+    trail = start_trail(curve(at[0]), slope(at[0]))
     trail = trail._replace(s=trail.s.at[0].set(at[0]))
     for s in at[1:]:
-        trail = extend(trail, s, curve(s), slope(s), ahead(trail, s), jnp.asarray(True))
+        trail = extend(trail, s, curve(s), slope(s), predict(trail, s), jnp.asarray(True))
     return trail
 
 
@@ -179,7 +179,7 @@ def test_prediction_is_exact_for_polynomials():
     curve = lambda s: jnp.sum(jnp.asarray(coefficients) * s ** jnp.arange(8)[:, None, None], axis=0)
     trail = trail_of(curve, jnp.array([0.1, 0.25, 0.3, 0.42]))
     assert int(trail.depth) == 4
-    np.testing.assert_allclose(ahead(trail, jnp.asarray(0.5)), curve(0.5) - curve(0.42), rtol=1e-10)
+    np.testing.assert_allclose(predict(trail, jnp.asarray(0.5)), curve(0.5) - curve(0.42), rtol=1e-10)
 
 
 def test_prediction_converges_with_its_order():
@@ -187,7 +187,7 @@ def test_prediction_converges_with_its_order():
     errors = []
     for h in (0.1, 0.05):
         trail = trail_of(curve, 0.3 + h * jnp.arange(3))
-        errors.append(float(jnp.abs(trail.x[0] + ahead(trail, 0.3 + 3 * h) - curve(0.3 + 3 * h)).max()))
+        errors.append(float(jnp.abs(trail.x[0] + predict(trail, 0.3 + 3 * h) - curve(0.3 + 3 * h)).max()))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(6, abs=0.5)
 
 
@@ -196,9 +196,9 @@ def test_a_jump_is_forgotten():
     curve = lambda s: jnp.stack([s, s**2])[None]
     trail = trail_of(curve, jnp.array([0.1, 0.2, 0.3]))
     s = jnp.asarray(0.4)
-    guess = ahead(trail, s)
+    guess = predict(trail, s)
     after = extend(trail, s, curve(s) + 1.0, jnp.ones((1, 2)), guess, jnp.asarray(True))
     assert int(after.depth) == 1
     unknown = extend(trail, s, curve(s), jnp.full((1, 2), jnp.nan), guess, jnp.asarray(False))
     assert int(unknown.depth) == 0
-    np.testing.assert_array_equal(ahead(unknown, jnp.asarray(0.5)), 0)
+    np.testing.assert_array_equal(predict(unknown, jnp.asarray(0.5)), 0)
