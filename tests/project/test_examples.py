@@ -12,7 +12,7 @@ NUMBERS = {
     "01_steer_beam": {"top pulled": 35.5152802, "bottom pulled": -34.9502718, "both pulled": -5.0890962},
     "02_ramp_curves": {"top pulled": 956.0045},
     "04_buckling": {"pulled in steps": -5.0890962},
-    "03_own_energy": {"without ground": -34.9502718, "with ground": -7.8098},
+    "03_own_energy": {"without ground": -34.9502718, "with ground": -7.8098, "wire": -11.1086},
     "05_reach_angle": {"nearest to 50": 35.5152802, "ratio for 34": 0.434703},
     "06_follow_path": {"lowest ratio": 0.4667},
     "07_design_shape": {"before": 0.060367},
@@ -23,7 +23,7 @@ NUMBERS = {
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
     "02_ramp_curves": {"tip_angle.png", "tendons.png", "fields_top.png", "fields_both.png"},
-    "03_own_energy": {"ground.png"},
+    "03_own_energy": {"ground.png", "wire.png"},
     "04_buckling": {"branches.png", "modes.png", "equilibria.png"},
     "05_reach_angle": {"fan.png", "commands.png"},
     "06_follow_path": {"path.png", "path.gif"},
