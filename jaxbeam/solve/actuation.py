@@ -40,9 +40,9 @@ def from_rest(scene: Scene, x: Any = None) -> Origin:
     return Origin(rest_commands(scene), none[0, 0], rest, none, np.int32(0), rest if x is None else x)
 
 
-def from_neighbour(scene: Scene, x: Any, ahead: Any) -> Origin:
-    """The origin in the equilibrium `x` of a `scene`, with a prediction `ahead` of it."""
-    return Origin(commands_of(scene), np.ones((), scene.mesh.nodes.dtype), x, ahead, np.int32(1), x)
+def from_neighbour(commands: Any, x: Any, ahead: Any) -> Origin:
+    """The origin in the equilibrium `x` of other `commands` `(m,)`, with a prediction `ahead` of it."""
+    return Origin(commands, np.ones((), commands.dtype), x, ahead, np.int32(1), x)
 
 
 def scene_between(origin: Origin, scene: Scene, s: jax.Array) -> Scene:

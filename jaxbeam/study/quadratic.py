@@ -53,12 +53,17 @@ def best_step(program: Program) -> tuple[np.ndarray, np.ndarray]:
     theta, miss, slope, soft = program.theta, program.miss, program.slope, program.soft
     free = np.where(program.held == 0, slope, 0)
     price = np.linalg.solve(free @ free.T + soft * np.eye(miss.size), free @ (program.rest - theta))
-    curvature = np.tensordot(price, program.bend, 1)
+    curvature = _weighted(price, program.bend)
     steepness = 10 * np.linalg.norm(curvature) / max(np.sum(slope**2), soft)
     step, held = _step_in_box(program, curvature, steepness)
     if np.linalg.norm(slope @ step + miss) <= 0.5 * np.linalg.norm(miss):
         return step, held
-    return _step_in_box(program, np.tensordot(miss / soft, program.bend, 1), 1 / soft)
+    return _step_in_box(program, _weighted(miss / soft, program.bend), 1 / soft)
+
+
+def _weighted(price: np.ndarray, bend: np.ndarray) -> np.ndarray:
+    """Curvature `(m, m)` of the components of the measure, weighted by a `price` `(p,)`."""
+    return (price @ bend.reshape(len(price), -1)).reshape(bend.shape[1:])
 
 
 def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
@@ -69,16 +74,18 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
     """
     m, p = program.theta.size, program.miss.size
     low, high = program.low, program.high
-    matrix = np.block(
-        [[_convex(program, curvature, weight), program.slope.T], [program.slope, -program.soft * np.eye(p)]]
-    )
+    matrix = np.zeros((m + p, m + p))
+    matrix[:m, :m] = _convex(program, curvature, weight)
+    matrix[:m, m:], matrix[m:, :m] = program.slope.T, program.slope
+    matrix[m:, m:] = -program.soft * np.eye(p)
     rhs = np.append(program.rest - program.theta, -program.miss)
 
     def solve(held: np.ndarray) -> np.ndarray:
         """Step and multipliers where the sides that hold are equations."""
-        rows, right, at = matrix.copy(), rhs.copy(), np.flatnonzero(held)
-        rows[at] = np.eye(m + p)[at]
-        right[at] = np.where(held < 0, low, high)[at]
+        rows, right = matrix.copy(), rhs.copy()
+        for k in np.flatnonzero(held):
+            rows[k], rows[k, k] = 0, 1
+            right[k] = low[k] if held[k] < 0 else high[k]
         return np.linalg.solve(rows, right)
 
     held = np.zeros(m, np.int32)
@@ -95,8 +102,9 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
             held[wrong] = 0
         else:
             break
-    step = np.clip(solve(held)[:m], low, high)
-    return np.where(held == 0, step, np.where(held < 0, low, high)), held
+    else:
+        step = solve(held)[:m]
+    return np.where(held == 0, np.clip(step, low, high), np.where(held < 0, low, high)), held
 
 
 def _convex(program: Program, curvature: np.ndarray, weight: float) -> np.ndarray:

@@ -148,7 +148,7 @@ def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
         origin = from_rest(scene)
     else:
         ahead = before.drift @ (theta - before.theta)
-        origin = from_neighbour(command(task.scene, before.theta), before.solution.x, ahead.astype(dtype))
+        origin = from_neighbour(before.theta.astype(dtype), before.solution.x, ahead.astype(dtype))
     solution, factor = solve_from(origin, scene, task.layout, task.solver)
     around = expand_measure(task.scene, task.layout, theta, solution.x, factor, task.measure, linear)
     value, slope, bend, drift = (each.astype(float) for each in jax.device_get(around))
