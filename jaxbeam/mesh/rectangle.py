@@ -69,6 +69,15 @@ def rectangle(
             f"ny: expected an odd number for mirrored diagonals, got {ny}: no row of nodes lies at mid-height; "
             f"use {ny + 1}, or crossed diagonals, which are symmetric for any ny"
         )
+    unit, elements = _unit_square(nx, ny, diagonals, graded)
+    xp = namespace(length, height)
+    extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
+    mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
+    return quadratic(mesh) if order == 2 else mesh
+
+
+def _unit_square(nx: int, ny: int, diagonals: Diagonals, graded: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Corners `(n, 2)` and triangles `(t, 3)` of the mesh of a square of side 1."""
     across, along = np.linspace(0, 1, nx), np.linspace(-0.5, 0.5, ny)
     if graded:
         middle = middle_column(nx, graded)
@@ -93,10 +102,7 @@ def rectangle(
             (np.where(falling, lower_right, lower_left), upper_right, upper_left),
         ]
     elements = np.stack([np.stack(t, axis=1) for t in triangles], axis=1).reshape(-1, 3)
-    xp = namespace(length, height)
-    extent = xp.stack([xp.asarray(length, dtype), xp.asarray(height, dtype)])
-    mesh = Mesh(xp.asarray(unit, dtype) * extent, elements)
-    return quadratic(mesh) if order == 2 else mesh
+    return unit, elements
 
 
 def middle_column(nx: int, graded: bool) -> int:
