@@ -44,6 +44,7 @@ class Energy:
     coordinates: ClassVar[int | None] = None  # coordinates of a node that it is made for: 2, 3 on a rod; None: any
     rest_command: ClassVar[float | None] = None  # command at which it does nothing; None: it is not commanded
     commands: ClassVar[checks.Range] = checks.FINITE  # the range of its commands
+    command_unit: ClassVar[float | None] = None  # a change of command of order 1; None: the width of its bounds
     command_hint: ClassVar[str] = ""  # what a command means, for the message about one out of range
 
     def __call__(self, x: jax.Array, params: Any) -> jax.Array:

@@ -92,6 +92,7 @@ class TendonEnergy(Energy):
     coordinates: ClassVar[int | None] = 2
     rest_command: ClassVar[float | None] = 1.0
     commands: ClassVar[checks.Range] = checks.POSITIVE
+    command_unit: ClassVar[float | None] = 1.0
     command_hint: ClassVar[str] = "1 is the natural length and 0.5 half of it"
 
     def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:

@@ -3,7 +3,7 @@
 The search is not differentiated. Its answer `theta` is a stationary point of a Lagrangian over the commands that no
 bound holds, with one multiplier `price` for each component of the measure (Nocedal and Wright 2006, section 12.3):
 
-    reached      L = 1/2 |theta - rest|^2 + price . (measure - target)
+    reached      L = 1/2 |(theta - rest) / unit|^2 + price . (measure - target)
     unreachable  L = 1/2 |measure - target|^2
 
 so by the implicit function theorem `z = (theta, price)` moves by `H dz = -d(grad L)`, with `H` the Hessian of `L` in
@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import pytree, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble
-from jaxbeam.scene.scene import Scene, command, rest_commands, stencil_hessians
+from jaxbeam.scene.scene import Scene, command, commanded_terms, rest_commands, stencil_hessians
 from jaxbeam.solve.equilibrium import differentiable
 from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton
@@ -43,6 +44,14 @@ class Problem:
     low: jax.Array
     high: jax.Array
     tolerance: jax.Array
+
+
+def command_units(problem: Problem) -> jax.Array:
+    """What efforts and steps of each command `(m,)` are measured in: 1 for ratios, else the width of its bounds."""
+    kinds = [term.kind.command_unit for term in commanded_terms(problem.scene) for _ in range(len(term.nodes))]
+    width = lax.stop_gradient(problem.high - problem.low)
+    known = np.array([np.nan if unit is None else unit for unit in kinds], problem.low.dtype)
+    return jnp.where(np.isfinite(known), known, jnp.where(width > 0, width, 1))
 
 
 class Answer(NamedTuple):
@@ -87,9 +96,11 @@ def follow_optimum(
     """`theta` `(m,)` of the answer itself and the multipliers `(p,)`, which move with the problem and the target
     `(p,)`. The tangents of the answer are ignored."""
     slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
-    slope = jnp.where(answer.held == 0, slope, 0)
+    unit = command_units(problem)
+    slope = jnp.where(answer.held == 0, slope * unit, 0)
     gram = slope @ slope.T
-    price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ (rest_commands(problem.scene) - answer.theta))
+    gap = (rest_commands(problem.scene) - answer.theta) / unit
+    price = jnp.linalg.pinv(gram, hermitian=True) @ (slope @ gap)
     return answer.theta, jnp.where(answer.reached & answer.trusted, price, 0)
 
 
@@ -107,6 +118,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     m, p = answer.theta.size, target.size
     theta, price = follow_optimum(measure, linear, *primals)
     # What is bad stays out of the derivatives of a loss that does not look at it.
+    unit = command_units(problem)
     goal = jnp.where(answer.trusted, target, 0)
     theta = jnp.where(answer.trusted, theta, answer.theta)
     price = jnp.where(answer.trusted, price, 0)
@@ -118,7 +130,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     def lagrangian(problem: Problem, target: jax.Array, z: jax.Array) -> jax.Array:
         theta, price = z[:m], z[m:]
         miss = _outcome(measure, linear, problem, theta, answer) - target
-        effort = 0.5 * jnp.sum((rest_commands(problem.scene) - theta) ** 2) + price @ miss
+        effort = 0.5 * jnp.sum(((rest_commands(problem.scene) - theta) / unit) ** 2) + price @ miss
         return jnp.where(answer.reached, effort, 0.5 * jnp.sum(miss**2) + 0.5 * jnp.sum(price**2))
 
     slope = jax.grad(lagrangian, argnums=2)
@@ -135,7 +147,8 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     small = jnp.sqrt(jnp.finfo(at.dtype).eps)
     sound = jnp.min(jnp.abs(values)) > small * jnp.max(jnp.abs(values))
     # At a bound that does not hold it, and with something to gain or to lose by leaving it.
-    weak = (answer.held == 0) & ((theta - problem.low <= REST) | (problem.high - theta <= REST))
+    near = REST * unit
+    weak = (answer.held == 0) & ((theta - problem.low <= near) | (problem.high - theta <= near))
     coupled = jnp.max(jnp.abs(scaled - jnp.diag(jnp.diagonal(scaled))), axis=1) > small
     sound &= ~jnp.any(weak & coupled[:m])
 

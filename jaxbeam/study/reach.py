@@ -21,7 +21,7 @@ from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure
-from jaxbeam.study.optimum import Answer, Problem, move_answer
+from jaxbeam.study.optimum import Answer, Problem, command_units, move_answer
 from jaxbeam.study.search import SearchState, Task, Trial, search
 
 # ------------------------------------------------------------------------------------------------ reach
@@ -46,10 +46,11 @@ def reach(
 ) -> Design:
     """Commands within `bounds` at which `measure` of the equilibrium is `target`.
 
-    Of all that reach it, the one of least effort `sum (rest - command)^2`, of tendons `sum (1 - ratio)^2`; if none
-    does, the one nearest to it. Found by sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact
-    first and second derivatives: each step is a small quadratic program in the commands. The search is local: where a
-    target is reached in several ways, or on several branches, give several `starts`, and the best answer is taken.
+    Of all that reach it, the one of least effort `sum (1 - ratio)^2`; if none does, the one nearest to it. The effort
+    of commands that are no ratios is that of their distance from rest, over the width of their bounds. Found by
+    sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact first and second derivatives: each
+    step is a small quadratic program in the commands. The search is local: where a target is reached in several ways,
+    or on several branches, give several `starts`, and the best answer is taken.
 
     Args:
         scene: with `m` tendons.
@@ -227,11 +228,14 @@ def _on_host(
             "call them outside jit, vmap and scan; jax.grad, jax.jacfwd and jax.jacrev of them work outside jit"
         )
     known, goals, starts = values
-    low, high = np.asarray(known.low, float), np.asarray(known.high, float)
+    unit = np.asarray(command_units(known), float)
+    low, high = np.asarray(known.low, float) / unit, np.asarray(known.high, float) / unit
     count = itertools.count(1)
     task = Task(
         scene=known.scene,
         layout=known.layout,
+        unit=unit,
+        rest=rest_commands(known.scene) / unit,
         target=np.zeros(0),
         low=low,
         high=high,
@@ -241,7 +245,7 @@ def _on_host(
         solver=solver,
         report=lambda distance: progress(next(count), distance) if progress else None,
     )
-    return task, np.asarray(goals, float), np.clip(np.asarray(starts, float), low, high)
+    return task, np.asarray(goals, float), np.clip(np.asarray(starts, float) / unit, low, high)
 
 
 def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[Design]:
@@ -297,9 +301,10 @@ def _design(task: Task, state: SearchState, shape: tuple[int, ...]) -> Design:
     theta, loss = np.full((most, at.theta.size), np.nan, dtype), np.full(most, np.nan, dtype)
     status = np.full(most, -1, np.int32)
     for k, each in enumerate(state.tried):
-        theta[k], loss[k], status[k] = each
+        tried, loss[k], status[k] = each
+        theta[k] = tried * task.unit
     return Design(
-        theta=to_device(at.theta.astype(dtype)),
+        theta=to_device((at.theta * task.unit).astype(dtype)),
         solution=at.solution,
         value=to_device((miss + task.target).astype(dtype).reshape(shape)),
         loss=to_device(np.linalg.norm(miss), dtype),

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbeam.core.tree import unlock
 from jaxbeam.linear.layout import Layout
-from jaxbeam.scene.scene import Scene, command, rest_commands
+from jaxbeam.scene.scene import Scene, command
 from jaxbeam.solve.actuation import from_neighbour, from_rest
 from jaxbeam.solve.equilibrium import solve_from
 from jaxbeam.solve.newton import Newton
@@ -34,14 +34,17 @@ REST = 1e-6
 
 
 class Task(NamedTuple):
-    """What is searched for. Numbers are NumPy arrays of float64.
+    """What is searched for, in NumPy arrays of float64. Commands, also those of trials, are in multiples of `unit`.
 
+    unit: `(m,)` of each command. rest: `(m,)` commands of no effort.
     target: `(p,)`. low, high: `(m,)` bounds. tolerance: largest deviation that counts as reached.
     report: called after each solve with the distance from the target.
     """
 
     scene: Scene
     layout: Layout
+    unit: np.ndarray
+    rest: np.ndarray
     target: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -58,7 +61,7 @@ class Trial(NamedTuple):
     theta: `(m,)`. miss: `(p,)` measure minus target. slope, bend, drift: as in `Expansion`.
     """
 
-    scene: Scene
+    task: Task
     theta: np.ndarray
     solution: Solution
     miss: np.ndarray
@@ -79,7 +82,7 @@ class Trial(NamedTuple):
     @property
     def effort(self) -> float:
         """Sum of the squared distances of the commands from rest."""
-        return float(np.sum((rest_commands(self.scene) - self.theta) ** 2))
+        return float(np.sum((self.task.rest - self.theta) ** 2))
 
     @property
     def good(self) -> bool:
@@ -142,17 +145,18 @@ def search(task: Task, theta: np.ndarray, before: Trial | None = None) -> Search
 def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
     """The equilibrium of the command `theta`, approached from `before` along its drift, and the measure around it."""
     dtype, linear = task.scene.mesh.nodes.dtype, task.solver.linear
-    theta = theta.astype(dtype)
-    scene = unlock(command(task.scene, theta))
+    theta, here = theta.astype(dtype), (theta * task.unit).astype(dtype)
+    scene = unlock(command(task.scene, here))
     if before is None:
         origin = from_rest(scene)
     else:
         ahead = before.drift @ (theta - before.theta)
-        origin = from_neighbour(before.theta.astype(dtype), before.solution.x, ahead.astype(dtype))
+        origin = from_neighbour((before.theta * task.unit).astype(dtype), before.solution.x, ahead.astype(dtype))
     solution, factor = solve_from(origin, scene, task.layout, task.solver)
-    around = expand_measure(task.scene, task.layout, theta, solution.x, factor, task.measure, linear)
+    around = expand_measure(task.scene, task.layout, here, solution.x, factor, task.measure, linear)
     value, slope, bend, drift = (each.astype(float) for each in jax.device_get(around))
-    return Trial(task.scene, theta.astype(float), solution, value - task.target, slope, bend, drift)
+    slope, bend, drift = slope * task.unit, bend * task.unit * task.unit[:, None], drift * task.unit
+    return Trial(task, theta.astype(float), solution, value - task.target, slope, bend, drift)
 
 
 def _record(task: Task, state: SearchState, trial: Trial) -> None:
@@ -194,8 +198,8 @@ def _plan(task: Task, state: SearchState) -> None:
     assert here is not None
     room, above = here.theta - task.low, task.high - here.theta
     low, high = np.maximum(-room, -radius), np.minimum(above, radius)
-    idle, soft = rest_commands(task.scene), softness(state.scale)
-    program = Program(here.theta, idle, here.miss, here.slope, here.bend, state.held, low, high, soft)
+    soft = softness(state.scale)
+    program = Program(here.theta, task.rest, here.miss, here.slope, here.bend, state.held, low, high, soft)
     step, held = best_step(program)
     # A command held by the radius alone is not held by a bound.
     state.held = np.where(np.where(held < 0, room <= radius, above <= radius), held, 0)
