@@ -174,8 +174,7 @@ class Problem(NamedTuple):
     policy: what the run may do.
     solver: settings.
     size: `()` of the body.
-    random_load: `(n, d)` 1 or -1 on free coordinates, zero on fixed ones: a load on all modes. Multiplied by the
-        round-off of the forces, it moves nodes by as much as their positions are uncertain, most along soft modes.
+    random_load: `(n, d)` 1 or -1 on free coordinates, zero on fixed ones: a load on all modes.
     """
 
     scene: Scene
@@ -314,12 +313,12 @@ def _solve(
     round_off: jax.Array,
     reuse: jax.Array | bool,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Solve for three right-hand sides: the unbalanced forces, those of the probe, and the random load.
+    """Solve for four right-hand sides: unbalanced forces, those of the probe, the random load, and round-off.
 
     Returns:
         The next step `(n, d)`; the response `(n, d)` to the probe; the Rayleigh quotient `()` of one inverse iteration
         with the random load, which near a limit of stability is the lowest eigenvalue; and the largest move `()` of a
-        node under that load, which is as large as the round-off of the forces.
+        node under forces as large as their round-off, of random signs.
     """
 
     def refinement(x: jax.Array, response: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -330,16 +329,13 @@ def _solve(
     zeros = jnp.zeros_like(x)
     left, response = compute_if(reuse, refinement, (zeros, zeros), x, state.response)
     probe = problem.policy.probe(x, stiffness.definite)
-    random = problem.random_load * round_off
-    loads = jnp.stack([evaluation.gradient, probe + left, random])
+    signs = problem.random_load
+    loads = jnp.stack([evaluation.gradient, probe + left, signs, signs * round_off])
     loads = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(problem.layout, loads)
     moves = problem.solver.linear.solve(problem.layout, stiffness.factor, loads)
     moves = jax.vmap(lambda move: expand(problem.layout, -move, x.shape), in_axes=1)(moves)
-    load, far = jnp.max(jnp.abs(random)), jnp.max(jnp.abs(moves[2]))
-    # Scaled, because squares of such small numbers would underflow.
-    unit = moves[2] / far
-    softest = -jnp.sum(random / load * unit) / jnp.sum(unit**2) * (load / far)
-    return moves[0], response + moves[1], softest, far
+    softest = -jnp.sum(signs * moves[2]) / jnp.sum(moves[2] ** 2)
+    return moves[0], response + moves[1], softest, jnp.max(jnp.abs(moves[3]))
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:
