@@ -88,7 +88,8 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
     Raises:
         ValueError: if the predicate returns another shape or selects nothing, or the nodes are traced.
 
-    >>> left = nodes_where(rectangle(2.0, 1.0, 3, 2), lambda x, y: x < -0.99)
+    >>> import jaxbeam as jb
+    >>> left = nodes_where(jb.rectangle(2.0, 1.0, 3, 2), lambda x, y: x < -0.99)
     >>> [int(i) for i in left]
     [0, 1]
     """

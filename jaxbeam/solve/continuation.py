@@ -293,8 +293,7 @@ def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume:
     converged = (attempt.residual <= problem.solver.tolerance(attempt.x.dtype)) & ~state.given_up
     finite = jnp.isfinite(attempt.evaluation.energy) & jnp.all(jnp.isfinite(attempt.evaluation.gradient))
     definite, marginal = attempt.stiffness.definite, attempt.stiffness.marginal
-    uncertain = jnp.maximum(attempt.correction, attempt.uncertainty) > INACCURATE
-    inaccurate = marginal | (definite & (uncertain | attempt.singular))
+    inaccurate = marginal | (definite & ((attempt.correction > INACCURATE) | attempt.singular))
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,

@@ -144,7 +144,6 @@ class State(NamedTuple):
     step: `(n, d)` the step to take next.
     response: `(n, d)` displacement under the forces of the probe, at `x`.
     correction: `()` largest move of a node in `step`, over the size of the body.
-    uncertainty: `()` largest move of a node under forces as large as their round-off, over the size of the body.
     singular: `()` whether the lowest eigenvalue of the stiffness is within its round-off.
     residual: `()` relative residual at `x`.
     counts: what was counted.
@@ -158,7 +157,6 @@ class State(NamedTuple):
     step: jax.Array
     response: jax.Array
     correction: jax.Array
-    uncertainty: jax.Array
     singular: jax.Array
     residual: jax.Array
     counts: Counts
@@ -174,7 +172,7 @@ class Problem(NamedTuple):
     policy: what the run may do.
     solver: settings.
     size: `()` of the body.
-    random_load: `(n, d)` 1 or -1 on free coordinates, zero on fixed ones: a load on all modes.
+    random_load: `(n, d)` a load on all modes, zero on fixed coordinates. What it moves tells how soft the softest is.
     """
 
     scene: Scene
@@ -225,7 +223,6 @@ def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
         step=displacement,
         response=zeros,
         correction=zero,
-        uncertainty=zero,
         singular=~yes,
         residual=jnp.asarray(jnp.inf, x.dtype),
         counts=Counts(none, none, none, none),
@@ -248,9 +245,8 @@ def step(problem: Problem, state: State) -> State:
     reuse, renew = _reuse(problem, state, balanced)
     stiffness_at = lambda x, finite: factorise(scene, problem.layout, x, finite, policy.leaving_saddle, solver.linear)
     stiffness = compute_if(renew, stiffness_at, state.stiffness, x, jnp.isfinite(unbalanced))
-    round_off = force_round_off(stiffness.rows, x)
-    residual = relative_residual(scene, evaluation, round_off, rtol)
-    next_step, response, softest, moved_by_noise = _solve(problem, state, x, evaluation, stiffness, round_off, reuse)
+    residual = relative_residual(scene, evaluation, force_round_off(stiffness.rows, x), rtol)
+    next_step, response, softest = _solve(problem, state, x, evaluation, stiffness, reuse)
     correction = jnp.max(jnp.abs(next_step)) / problem.size
     # In balance, but a step would still move it: rounding keeps the positions from rest along a soft mode, and each
     # step rounds them anew.
@@ -263,7 +259,6 @@ def step(problem: Problem, state: State) -> State:
         step=next_step,
         response=response,
         correction=correction,
-        uncertainty=moved_by_noise / problem.size,
         singular=softest <= SINGULAR * float(jnp.finfo(x.dtype).eps) * jnp.max(stiffness.rows),
         residual=residual,
         counts=_count(state, taken, halvings, polish),
@@ -310,15 +305,13 @@ def _solve(
     x: jax.Array,
     evaluation: Evaluation,
     stiffness: Stiffness,
-    round_off: jax.Array,
     reuse: jax.Array | bool,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Solve for four right-hand sides: unbalanced forces, those of the probe, the random load, and round-off.
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Solve for three right-hand sides: the unbalanced forces, those of the probe, and the random load.
 
     Returns:
-        The next step `(n, d)`; the response `(n, d)` to the probe; the Rayleigh quotient `()` of one inverse iteration
-        with the random load, which near a limit of stability is the lowest eigenvalue; and the largest move `()` of a
-        node under forces as large as their round-off, of random signs.
+        The next step `(n, d)`; the response `(n, d)` to the probe; and the Rayleigh quotient `()` of one inverse
+        iteration with the random load, which near a limit of stability is the lowest eigenvalue.
     """
 
     def refinement(x: jax.Array, response: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -329,13 +322,12 @@ def _solve(
     zeros = jnp.zeros_like(x)
     left, response = compute_if(reuse, refinement, (zeros, zeros), x, state.response)
     probe = problem.policy.probe(x, stiffness.definite)
-    signs = problem.random_load
-    loads = jnp.stack([evaluation.gradient, probe + left, signs, signs * round_off])
+    loads = jnp.stack([evaluation.gradient, probe + left, problem.random_load])
     loads = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(problem.layout, loads)
     moves = problem.solver.linear.solve(problem.layout, stiffness.factor, loads)
     moves = jax.vmap(lambda move: expand(problem.layout, -move, x.shape), in_axes=1)(moves)
-    softest = -jnp.sum(signs * moves[2]) / jnp.sum(moves[2] ** 2)
-    return moves[0], response + moves[1], softest, jnp.max(jnp.abs(moves[3]))
+    softest = -jnp.sum(problem.random_load * moves[2]) / jnp.sum(moves[2] ** 2)
+    return moves[0], response + moves[1], softest
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:

@@ -424,7 +424,7 @@ def test_patches_and_curved_edges_move_in_animations(anchored):
 @pytest.fixture(scope="module")
 def rod():
     """A rod with a tendon on either side of its first half, wound around a circle in three states."""
-    scene = jb.scene.rod_beam(7, length=3.0, height=0.8)
+    scene = jb.rod_beam(7, length=3.0, height=0.8)
     along = np.asarray(scene.mesh.nodes)[:, 0] + 1.5
     curvature = np.array([1e-9, 0.25, 0.5])[:, None]
     turn = curvature * along
