@@ -63,15 +63,13 @@ def line_names(scene: Scene) -> list[str]:
 
 def term_lines(scene: Scene, x: np.ndarray) -> list[np.ndarray]:
     """The points `(p, 2)` of each line that a term is drawn as, such as those that a tendon runs through."""
-    found: list[np.ndarray] = []
-    for term, _ in drawn_terms(scene):
-        found += [*np.asarray(term.kind.line(x[term.nodes], term.params))]
-    return found
+    each = [term.kind.line(x[term.nodes], term.params) for term in scene.terms]
+    return [line for lines in each if lines is not None for line in np.asarray(lines)]
 
 
 def arms(scene: Scene, x: np.ndarray) -> np.ndarray:
     """Segments `(q, 2, 2)` from the body to points of lines that are not nodes, as beside a rod."""
-    found = [term.kind.arms(x[term.nodes], term.params) for term, _ in drawn_terms(scene)]
+    found = [term.kind.arms(x[term.nodes], term.params) for term in scene.terms]
     return np.concatenate([np.zeros((0, 2, 2)), *(np.reshape(each, (-1, 2, 2)) for each in found if each is not None)])
 
 
