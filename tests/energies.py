@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 
 from tests.geometry import SIDES, determinants, patch, volumes
 
@@ -308,9 +309,10 @@ class Facts(NamedTuple):
     """What is true at `x`.
 
     energy_scale and scale_sum are sums of magnitudes, over all coordinates. scale is the largest sum of magnitudes of
-    the forces at one free coordinate, and stiffest the largest diagonal entry of the Hessian there. gradient and
-    hessian are over free coordinates. volumes are the least `J` of each element and bounds under it, of a rod the least
-    stretch of a fibre; heights `(t,)` those of elements at rest.
+    the forces at one free coordinate, stiffest the largest diagonal entry of the Hessian there, and longest_row the
+    largest Euclidean length of a row of it. gradient and hessian are over free coordinates. volumes are the least `J`
+    of each element and bounds under it, of a rod the least stretch of a fibre; heights `(t,)` those of elements at
+    rest.
     """
 
     energy: float
@@ -322,6 +324,7 @@ class Facts(NamedTuple):
     scale_sum: float
     hessian: np.ndarray | None
     stiffest: float
+    longest_row: float
     volumes: np.ndarray
     bounds: np.ndarray
     heights: np.ndarray
@@ -331,8 +334,8 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
     """Energy, forces and, if asked for, the dense Hessian at `x` `(n, d)`."""
     y, free = problem.relative(x), ~np.asarray(problem.fixed).ravel()
     d = y.shape[1]
-    gradient, scale, diagonal = np.zeros(y.shape), np.zeros(y.shape), np.zeros(y.size)
-    hessian = np.zeros((y.size, y.size)) if dense else None
+    gradient, scale = np.zeros(y.shape), np.zeros(y.shape)
+    sparse = scipy.sparse.csr_array((y.size, y.size))
     energy = energy_scale = 0.0
     for kind in problem.stencils(ratios, loaded):
         found = _derivatives(kind.energy, y[kind.nodes], kind.params)
@@ -342,11 +345,10 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
         np.add.at(scale, kind.nodes, np.abs(gradients))
         unknowns = (d * kind.nodes[..., None] + np.arange(d)).reshape(len(kind.nodes), -1)
         hessians = hessians.reshape(-1, *unknowns.shape[1:] * 2)
-        np.add.at(diagonal, unknowns, np.diagonal(hessians, axis1=1, axis2=2))
-        if dense:
-            np.add.at(hessian, (unknowns[:, :, None], unknowns[:, None, :]), hessians)
+        places = [np.broadcast_to(each, hessians.shape).ravel() for each in (unknowns[:, :, None], unknowns[:, None])]
+        sparse = sparse + scipy.sparse.coo_array((hessians.ravel(), places), sparse.shape).tocsr()
     least, bounds, heights, cancelled = _shape(problem, y)
-    gradient = gradient.ravel()[free]
+    gradient, sparse = gradient.ravel()[free], sparse[free]
     return Facts(
         energy=float(energy),
         energy_scale=float(energy_scale),
@@ -355,8 +357,9 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
         gradient=gradient,
         scale=float(scale.ravel()[free].max()),
         scale_sum=float(scale.sum()),
-        hessian=hessian[np.ix_(free, free)] if dense else None,
-        stiffest=float(np.abs(diagonal[free]).max()),
+        hessian=sparse[:, free].toarray() if dense else None,
+        stiffest=float(np.abs(sparse[:, free].diagonal()).max()),
+        longest_row=float(np.sqrt(np.asarray(sparse.multiply(sparse).sum(axis=1))).max()),
         volumes=least,
         bounds=bounds,
         heights=heights,

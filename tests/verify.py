@@ -6,8 +6,9 @@ and does not keep, `refuted_slope` compares a derivative.
 
 What counts as round-off, with `eps` that of the dtype of the solve and `K` the dense Hessian over free coordinates:
 
-- forces: the library's own definition, `1.5 eps max |x| max K_ii`; the tolerance is met within `FACTOR`, for a
-  different order of summation;
+- forces: positions are rounded independently by `eps max |x|`, which a row of `K` turns into a force of that times its
+  Euclidean length: 1.5 times that of the longest row. The tolerance is met within `FACTOR`, for a different order of
+  summation;
 - positions: Newton's method in float64 from `x` settles within `OFF` of the body's size, whatever the forces;
 - eigenvalues: a Cholesky factorisation of `N` unknowns is exact for a matrix that differs by about
   `eps sqrt(N) max K_ii`, so `EIGEN eps sqrt(N) max K_ii` cannot be told from zero;
@@ -73,7 +74,7 @@ class Claim(NamedTuple):
 
     def residual(self, true: Facts) -> float:
         """The largest unbalanced force over the force scale, which leaves room for round-off."""
-        return true.unbalanced / (true.scale + FORCE * self.eps * true.stiffest * self.reach / self.rtol)
+        return true.unbalanced / (true.scale + FORCE * self.eps * true.longest_row * self.reach / self.rtol)
 
 
 def verify(problem: Problem, ratios: np.ndarray, answer: Any, stability: bool = True) -> Verdict:

@@ -2,8 +2,8 @@
 
 Each takes `H = F - I` `(2, 2)`, with `F` the deformation gradient, and `Lame` parameters, and returns the
 energy per unit rest volume (units of Young's modulus; thickness is 1). Written in `H`, small strains keep
-their digits: `|F|^2 - 2 = 2 tr H + |H|^2`, `J - 1 = tr H + det H`. All are differentiable to any order in
-`H` and in the parameters.
+their digits: `J - 1 = tr H + det H`, and `(|F|^2 - 2) / 2 - (J - 1)` is `distortion`. All are differentiable to any
+order in `H` and in the parameters.
 """
 
 from __future__ import annotations
@@ -76,6 +76,14 @@ def material_is_valid(material: Any) -> Any:
     return jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
 
 
+def distortion(H: jax.Array) -> jax.Array:
+    """`(|F|^2 - 2) / 2 - (J - 1)`, as half a sum of squares: zero where `F` only turns and stretches evenly.
+
+    Summed up term by term it would lose, in a body that turns, the digits of a small strain.
+    """
+    return 0.5 * ((H[0, 0] - H[1, 1]) ** 2 + (H[0, 1] + H[1, 0]) ** 2)
+
+
 def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
     """Stable neo-Hookean, `mu/2 (|F|^2 - 2) - mu (J - 1) + lam/2 (J - 1)^2`.
 
@@ -84,10 +92,8 @@ def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
 
     Source: Macklin and Mueller, "A constraint-based formulation of stable neo-Hookean materials", MIG 2021.
     """
-    det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
-    volume = H[0, 0] + H[1, 1] + det
-    # mu/2 * 2 tr H and mu tr H cancel exactly; leaving both out keeps the digits of small strains.
-    return params.mu * (0.5 * jnp.sum(H * H) - det) + 0.5 * params.lam * volume**2
+    volume = H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+    return params.mu * distortion(H) + 0.5 * params.lam * volume**2
 
 
 def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
@@ -97,10 +103,9 @@ def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
 
     Source: Bonet and Wood, "Nonlinear Continuum Mechanics for Finite Element Analysis", 2008, eq. 6.27.
     """
-    det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
-    volume = H[0, 0] + H[1, 1] + det
+    volume = H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
     log_j = jnp.log1p(volume)
-    return params.mu * (0.5 * jnp.sum(H * H) - det + _less_log1p(volume)) + 0.5 * params.lam * log_j**2
+    return params.mu * (distortion(H) + _less_log1p(volume)) + 0.5 * params.lam * log_j**2
 
 
 @jax.custom_jvp

@@ -13,7 +13,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
-from jaxbeam.mesh.line import Line, beside
+from jaxbeam.mesh.line import Line, aside
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.physics.energy import NotRefinable, Term
 from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, polyline_length, tendons
@@ -32,8 +32,8 @@ class Offsets:
 
 
 def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
-    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`."""
-    return beside(x, attachment.eccentricity, attachment.radian)
+    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`, measured from the first node."""
+    return (x[..., :2] - x[..., :1, :2]) + aside(x, attachment.eccentricity, attachment.radian)
 
 
 @dataclasses.dataclass(frozen=True)

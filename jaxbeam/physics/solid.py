@@ -129,7 +129,8 @@ def solid(
     points, shares = rule(element.degree if degree is None else checks.count("degree", degree, 1))
     # How a triangle is mapped from the reference one, and the inverse of that, at each point.
     slopes = xp.asarray(element.slopes(points), dtype)
-    map_ = xp.einsum("mkd,qki->mqdi", rest, slopes)
+    # From the first node, so that a place far from the origin costs no digits.
+    map_ = xp.einsum("mkd,qki->mqdi", rest - rest[:, :1], slopes)
     determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
     inverse = xp.stack([map_[..., 1, 1], -map_[..., 0, 1], -map_[..., 1, 0], map_[..., 0, 0]], axis=-1)
     inverse = inverse.reshape(map_.shape) / determinant[..., None, None]

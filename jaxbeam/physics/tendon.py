@@ -68,14 +68,18 @@ def check_law(stiffness: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
         checks.scalar("stiffness", form, stiffness, *2 * [jax.ShapeDtypeStruct((), jnp.result_type(float))])
 
 
+# Points of a tendon are measured from its first node: products and sums with places far from the origin would lose the
+# digits that tell the points apart.
+
+
 def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
-    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes."""
-    return x
+    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes, measured from the first."""
+    return x - x[:1]
 
 
 def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
     """The points `(p, 2)` of a tendon that are weighted means, by weights `(p, k)`, of its `k` nodes."""
-    return jnp.sum(attachment[:, :, None] * x, axis=1)
+    return jnp.sum(attachment[:, :, None] * (x - x[:1]), axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +142,7 @@ class TendonEnergy(Energy):
         return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
 
     def line(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        return jax.vmap(self.points)(x, params.attachment)[..., :2]
+        return x[:, :1, :2] + jax.vmap(self.points)(x, params.attachment)
 
     def anchors(self, params: TendonParams) -> tuple[np.ndarray, np.ndarray] | None:
         return None if params.ends is None else (params.ends, np.asarray(params.width))
@@ -200,7 +204,9 @@ def tendons(
     else:
         nodes_of, weights = _means(mesh, lines, widths)
         energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
-        natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, np.asarray(rest)[nodes_of]).astype(dtype))
+        places = np.asarray(rest)[nodes_of]
+        points = np.einsum("mpk,mkd->mpd", weights, places - places[:, :1])
+        natural = polyline_length(points.astype(dtype))
     xp = namespace(modulus)
     moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
     return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))

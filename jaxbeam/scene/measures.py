@@ -37,7 +37,7 @@ def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
             "scene: its tip is clamped, so the tip angle is always 0; give Scene(..., tip=nodes) that move"
         )
     along, length = _axis(scene)
-    moved = tip_position(scene, x) - tip_position(scene, scene.mesh.nodes)
+    moved = jnp.mean((x - scene.mesh.nodes)[scene.tip, :2], axis=0)
     return jnp.rad2deg(jnp.arctan2(along[0] * moved[1] - along[1] * moved[0], length))
 
 

@@ -202,6 +202,21 @@ def test_digits_at_small_strain_in_float32(density, size):
     np.testing.assert_allclose(single[1], double[1], atol=bound * np.abs(double[1]).max())
 
 
+@pytest.mark.parametrize("density", [jb.macklin_mueller, jb.neo_hookean, jb.saint_venant_kirchhoff])
+@pytest.mark.parametrize("angle", [0.3, 1.5, 3.0])
+def test_digits_of_a_small_strain_in_a_turned_body_in_float32(density, angle):
+    """Summed up term by term, `|H|^2 / 2 - det H` would be off by eps of 1 and not of the strain: ten times the energy
+    at a strain of 1e-4, and negative for some."""
+    F = rotation(angle) @ (np.eye(2) + 1e-4 * np.array([[0.7, 0.4], [0.4, -0.5]]))
+    H = jnp.asarray(F - np.eye(2), jnp.float32)
+    single, double = (
+        density(jnp.asarray(H, dtype), jb.Lame(jnp.asarray(MU, dtype), jnp.asarray(LAM, dtype)))
+        for dtype in (jnp.float32, jnp.float64)
+    )
+    # `J - 1` and the strains are off by some eps, the energy by that times its slope.
+    assert abs(float(single) - float(double)) < 10 * np.finfo(np.float32).eps * LAM * 1e-4
+
+
 def test_neo_hookean_keeps_digits_of_ln_j():
     """At strain 1e-9 in float64, the volume part of the energy is right to round-off against a series."""
     e = 1e-9

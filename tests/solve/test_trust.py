@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.mesh.line import Line
+from jaxbeam.physics.rod import rod
+from jaxbeam.physics.rod_tendon import rod_tendons
 
 NX, NY = 9, 5
 
@@ -74,6 +77,55 @@ def test_a_mesh_far_from_the_origin(dtype, near, far, height):
             if shift == near:
                 assert int(found.status) == 0
             assert int(found.status) == jb.Status.INACCURATE or off < 2e-3
+
+
+def two_tendons(shift, order=1, width=0.0):
+    """A beam of a square grid, so that a shift by a power of two rounds nothing."""
+    mesh = jb.rectangle(4.0, 1.0, 9, 5, "crossed", order=order)
+    mesh = jb.Mesh(np.asarray(mesh.nodes) + shift, mesh.elements)
+    terms = jb.solid(mesh, jb.lame(1e4, 0.45)), jb.tendons(mesh, [[4, 14, 24], [0, 10, 20]], 2e3, width=width)
+    return jb.Scene(mesh, terms, jb.clamped(mesh, np.arange(5)), np.arange(40, 45))
+
+
+def rod_of(shift, dtype=None, height=1.0, modulus=2e3, poisson=0.45, force=0.0):
+    """The reference scene as a rod of nine nodes."""
+    along = np.linspace(-0.5, 0.5, 9)
+    nodes = 3.5 * np.stack([along, 0 * along, 0 * along], axis=1) + shift * np.array([1.0, 0.5, 0.0])
+    line = Line(nodes.astype(dtype or float), np.stack([np.arange(8), np.arange(1, 9)], axis=1), height)
+    sides = 0.5 * height * np.array([[1.0, 1.0], [-1.0, -1.0]])
+    terms = rod(line, height, jb.lame(1e4, poisson)), rod_tendons(line, [[0, 4]] * 2, sides, modulus)
+    load = jb.dead_load(line, [8], [[0.0, 0.3 * force, 0.1 * force]])
+    return jb.Scene(line, (*terms, load), jb.clamped(line, [0]), np.array([8]))
+
+
+@pytest.mark.parametrize(
+    "build",
+    [two_tendons, lambda shift: two_tendons(shift, width=0.5), lambda shift: two_tendons(shift, 2, 0.5), rod_of],
+    ids=["nodes", "anchors", "six-node", "rod"],
+)
+def test_where_the_body_lies_costs_no_digits(build):
+    """Moved by 2^43 without rounding, a body has the same energy, forces and measures: all are made of differences."""
+    near, far = build(0.0), build(2.0**43)
+    moved = np.random.default_rng(3).integers(-8, 8, near.mesh.nodes.shape) / 2.0**9
+    found = []
+    for scene in (near, far):
+        commanded = jb.command(scene, [0.7, 0.9])
+        x = jnp.asarray(np.asarray(scene.mesh.nodes) + moved)
+        measures = jb.tendon_lengths, jb.tendon_tensions, jb.tip_angle, jb.smallest_jacobian
+        found.append([jb.energy(commanded, x), jb.forces(commanded, x), *(each(commanded, x) for each in measures)])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
+
+
+def test_rounding_far_away_pretends_tension():
+    """Of stiff tendons far from the origin. One more Newton step is short then, and the equilibrium is not near."""
+    scene, centred = (rod_of(s, t, 0.35, 2e7, 0.499, 1.0) for s, t in ((3500.0, jnp.float32), (0.0, jnp.float64)))
+    found = jb.ramp(scene, [0.02, 1.0], 28)
+    truth = jb.check(jb.ramp(centred, [0.02, 1.0], 28))
+    shift = np.asarray(scene.mesh.nodes[4]) - np.asarray(centred.mesh.nodes[4])
+    off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max(axis=(1, 2)) / 3.5
+    assert (off > 5e-3).any()
+    assert np.all((np.asarray(found.status) == jb.Status.INACCURATE) | (off < 2e-3))
 
 
 # ------------------------------------------------------------------------------------------ limits of stability
