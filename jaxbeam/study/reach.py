@@ -82,7 +82,7 @@ def reach(
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    goal = checks.numbers("target", target)
+    goal = _numbers("target", target)
     if goal.shape != shape:
         raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
     goal = jnp.asarray(goal, scene.mesh.nodes.dtype)
@@ -113,7 +113,7 @@ def reach_each(
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    goals = checks.numbers("targets", targets)
+    goals = _numbers("targets", targets)
     if goals.ndim != len(shape) + 1 or goals.shape[1:] != shape or not goals.shape[0]:
         rows = f"(T, {shape[0]})" if shape else "(T,)"
         raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
@@ -169,6 +169,11 @@ def _problem(
     return problem, begin
 
 
+def _numbers(name: str, target: Numbers) -> Any:
+    """Targets, checked. A traced one may be NaN: its search fails, and harms the derivative of no other."""
+    return checks.numbers(name, target) if is_concrete(target) else checks.real(name, target)
+
+
 def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
     """The shape of a measure's value, checked."""
     checks.function("measure", measure, "(scene, x) to shape () or (p,)")
@@ -189,9 +194,13 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
         trusted=(found.status != DesignStatus.NOT_CONVERGED) & (found.solution.status == 0),
     )
     theta, solution, value = move_answer(measure, solver, problem, target, answer, found.solution)
-    # The slope of the distance exists nowhere at zero, where it stays.
-    miss, away = jnp.ravel(value - target), found.loss != 0
-    loss = jnp.where(away, jnp.linalg.norm(jnp.where(away, miss, 1)), 0 * jnp.sum(miss))
+    miss = jnp.ravel(value - target)
+    moving = answer.trusted & (found.loss != 0)
+    distance = jnp.linalg.norm(jnp.where(moving, miss, 1))
+    # At zero the distance has no slope, and stays. Of a failed search its slope is NaN, as that of `theta` is, and not
+    # by way of a distance that may be NaN itself: zero times that would reach a loss that does not look at it.
+    failed = found.loss + jnp.sum(theta - lax.stop_gradient(theta))
+    loss = jnp.where(moving, distance, jnp.where(answer.trusted, 0 * jnp.sum(miss), failed))
     return replace(found, theta=theta, solution=solution, value=value, loss=loss)
 
 
@@ -254,7 +263,7 @@ def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[De
     designs = []
     for target in targets:
         one = task._replace(target=np.ravel(target))
-        state = _search_all(one, begin) if before is None else search(one, before.theta, before)
+        state = _search_all(one, begin) if before is None else search(one, before)
         before = before if state.here is None else state.here
         designs.append(_design(one, state, target.shape))
     return designs

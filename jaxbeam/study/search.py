@@ -58,16 +58,21 @@ class Task(NamedTuple):
 class Trial(NamedTuple):
     """A command that was solved, and the measure around it.
 
-    theta: `(m,)`. miss: `(p,)` measure minus target. slope, bend, drift: as in `Expansion`.
+    theta: `(m,)`. value: `(p,)` of the measure. slope, bend, drift: as in `Expansion`.
     """
 
     task: Task
     theta: np.ndarray
     solution: Solution
-    miss: np.ndarray
+    value: np.ndarray
     slope: np.ndarray
     bend: np.ndarray
     drift: np.ndarray
+
+    @property
+    def miss(self) -> np.ndarray:
+        """Measure minus target `(p,)`."""
+        return self.value - self.task.target
 
     @property
     def distance(self) -> float:
@@ -117,18 +122,17 @@ class SearchState:
     status: DesignStatus = DesignStatus.NOT_CONVERGED
 
 
-def search(task: Task, theta: np.ndarray, before: Trial | None = None) -> SearchState:
-    """Sequential quadratic programming from the command `theta` `(m,)`, approached from the trial `before`, or from
-    rest.
+def search(task: Task, start: np.ndarray | Trial) -> SearchState:
+    """Sequential quadratic programming from a command `(m,)`, approached from rest, or from a trial of another target.
 
     A command that has no effect, to first or second order, may have one elsewhere: a tendon that is slack, or a measure
     that is flat. Where the search would end short of the target, such commands are shortened until an effect is seen.
     """
-    m = theta.size
+    m = task.rest.size
     state = SearchState(step=np.zeros(m), held=np.zeros(m, np.int32), seen=np.zeros(m, bool))
+    trial = start._replace(task=task) if isinstance(start, Trial) else _tried(task, state, start, None)
     while True:
-        trial = solve_trial(task, theta, before)
-        _record(task, state, trial)
+        state.last = trial
         _judge(task, state, trial)
         if state.here is None or not np.isfinite(state.here.miss).all():
             break
@@ -136,8 +140,7 @@ def search(task: Task, theta: np.ndarray, before: Trial | None = None) -> Search
         small = not state.radius > 1e-3 * REST
         if state.resting or small or state.solves >= task.max_solves or not np.isfinite(state.step).all():
             break
-        before = state.here
-        theta = np.clip(before.theta + state.step, task.low, task.high)
+        trial = _tried(task, state, np.clip(state.here.theta + state.step, task.low, task.high), state.here)
     state.status = _status(task, state)
     return state
 
@@ -156,14 +159,16 @@ def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
     around = expand_measure(task.scene, task.layout, here, solution.x, factor, task.measure, linear)
     value, slope, bend, drift = (each.astype(float) for each in jax.device_get(around))
     slope, bend, drift = slope * task.unit, bend * task.unit * task.unit[:, None], drift * task.unit
-    return Trial(task, theta.astype(float), solution, value - task.target, slope, bend, drift)
+    return Trial(task, theta.astype(float), solution, value, slope, bend, drift)
 
 
-def _record(task: Task, state: SearchState, trial: Trial) -> None:
-    state.last = trial
+def _tried(task: Task, state: SearchState, theta: np.ndarray, before: Trial | None) -> Trial:
+    """A new trial, recorded."""
+    trial = solve_trial(task, theta, before)
     state.solves += 1
     state.tried.append((trial.theta, trial.distance, int(trial.solution.status)))
     task.report(trial.distance)
+    return trial
 
 
 def _judge(task: Task, state: SearchState, new: Trial) -> None:
