@@ -148,6 +148,13 @@ def edge_functions(nodes: int, xi: np.ndarray) -> np.ndarray:
     return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=-1)
 
 
+def edge_products(nodes: int) -> np.ndarray:
+    """Integrals `(nodes, nodes)` along an edge of each shape function times the slope of each."""
+    if nodes == 2:
+        return np.array([[-1, 1], [-1, 1]]) / 2
+    return np.array([[-3, -1, 4], [1, 3, -4], [-4, 4, 0]]) / 6
+
+
 # --------------------------------------------------------------------------- how the map of an element stretches area
 
 

@@ -43,6 +43,7 @@ class Energy:
     fills: ClassVar[bool] = False  # its stencils are elements of area, whose outer edges are the surface of the body
     coordinates: ClassVar[int | None] = None  # coordinates of a node that it is made for: 2, 3 on a rod; None: any
     rest_command: ClassVar[float | None] = None  # command at which it does nothing; None: it is not commanded
+    shared_command: ClassVar[bool] = False  # one command for all stencils of a term, and not one for each
     commands: ClassVar[checks.Range] = checks.FINITE  # the range of its commands
     command_unit: ClassVar[float | None] = None  # a change of command of order 1; None: the width of its bounds
     command_hint: ClassVar[str] = ""  # what a command means, for the message about one out of range
@@ -67,11 +68,11 @@ class Energy:
     # -------------------------------------------------------------------------------------- actuation
 
     def command(self, params: Any, values: jax.Array) -> Any:
-        """The parameters under commands `(m,)`, one for each stencil."""
+        """The parameters under commands `(m,)`, one for each stencil, or `(1,)` if they share it."""
         return params
 
     def command_of(self, params: Any) -> jax.Array:
-        """The commands `(m,)` that the parameters are under: the inverse of `command`."""
+        """The commands `(m,)` or `(1,)` that the parameters are under: the inverse of `command`."""
         raise NotImplementedError
 
     def partway(self, params: Any, share: jax.Array) -> Any:
@@ -85,6 +86,10 @@ class Energy:
     def valid(self, params: Any) -> Any:
         """Whether traced parameters are in their range `()`. That they are finite is checked for every term."""
         return True
+
+    def objection(self, term: Term, fixed: np.ndarray) -> str:
+        """Why the term cannot act where the coordinates `fixed` `(n, d)` do not move, or nothing."""
+        return ""
 
     def margin(self, x: jax.Array, params: Any) -> jax.Array | None:
         """What must stay positive `(m,)`, such as the smallest `J` of an element; None if there is nothing."""
@@ -192,6 +197,13 @@ class Term:
     def kind(self) -> Energy:
         """The energy with all that it says of itself."""
         return self.energy if isinstance(self.energy, Energy) else BareFunction(self.energy)
+
+    @property
+    def command_count(self) -> int:
+        """How many commands it takes."""
+        if self.kind.rest_command is None:
+            return 0
+        return 1 if self.kind.shared_command else len(self.nodes)
 
 
 def check_nodes(name: str, mesh: Mesh, nodes: Numbers, ndim: int) -> np.ndarray:

@@ -81,6 +81,8 @@ class Scene:
                     f"{shape[1]}; on triangles use solid and tendons, on the Line of a rod use rod and rod_tendons"
                 )
             _check_energy(number, term, self.mesh.nodes)
+            if objection := term.kind.objection(term, fixed):
+                raise ValueError(f"terms[{number}]: {objection}")
         tip = check_nodes("tip", self.mesh, self.tip, ndim=1) if np.size(self.tip) else np.zeros(0)
         object.__setattr__(self, "fixed", read_only(fixed))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
@@ -151,7 +153,7 @@ def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
 
 @usual_rules
 def command(scene: Scene, commands: Numbers) -> Scene:
-    """The scene under new commands, one for each stencil that is commanded.
+    """The scene under new commands, one for each stencil that is commanded, or for each term whose stencils share it.
 
     Args:
         scene: with `m` commands in all, in the order of its terms.
@@ -166,7 +168,7 @@ def command(scene: Scene, commands: Numbers) -> Scene:
     terms, start = [], 0
     for term in scene.terms:
         if term.kind.rest_command is not None:
-            stop = start + term.nodes.shape[0]
+            stop = start + term.command_count
             term, start = replace(term, params=term.kind.command(term.params, values[start:stop])), stop
         terms.append(term)
     return replace(scene, terms=tuple(terms))
@@ -181,20 +183,20 @@ def check_commands(name: str, scene: Scene, values: Any) -> None:
         return
     start, several = 0, len(commanded_terms(scene)) > 1
     for term in commanded_terms(scene):
-        stop = start + term.nodes.shape[0]
+        stop = start + term.command_count
         which = f"{name}[{start}:{stop}]" if several else name
         checks.inside(which, values[..., start:stop], term.kind.commands, why=term.kind.command_hint)
         start = stop
 
 
 def commanded_terms(scene: Scene) -> list[Term]:
-    """The terms that are commanded, in order; their stencils are numbered through."""
+    """The terms that are commanded, in order; their commands are numbered through."""
     return [term for term in scene.terms if term.kind.rest_command is not None]
 
 
 def command_count(scene: Scene) -> int:
     """How many commands there are to give."""
-    return sum(term.nodes.shape[0] for term in commanded_terms(scene))
+    return sum(term.command_count for term in scene.terms)
 
 
 def commands_of(scene: Scene) -> jax.Array:
@@ -205,7 +207,7 @@ def commands_of(scene: Scene) -> jax.Array:
 
 def rest_commands(scene: Scene) -> np.ndarray:
     """The commands `(m,)` under which nothing acts: 1 for a tendon."""
-    found = [np.full(len(term.nodes), term.kind.rest_command) for term in commanded_terms(scene)]
+    found = [np.full(term.command_count, term.kind.rest_command) for term in commanded_terms(scene)]
     return np.concatenate([*found, np.zeros(0)]).astype(scene.mesh.nodes.dtype)
 
 

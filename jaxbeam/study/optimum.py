@@ -48,7 +48,7 @@ class Problem:
 
 def command_units(problem: Problem) -> jax.Array:
     """What efforts and steps of each command `(m,)` are measured in: 1 for ratios, else the width of its bounds."""
-    kinds = [term.kind.command_unit for term in commanded_terms(problem.scene) for _ in range(len(term.nodes))]
+    kinds = [term.kind.command_unit for term in commanded_terms(problem.scene) for _ in range(term.command_count)]
     width = lax.stop_gradient(problem.high - problem.low)
     known = np.array([np.nan if unit is None else unit for unit in kinds], problem.low.dtype)
     return jnp.where(np.isfinite(known), known, jnp.where(width > 0, width, 1))

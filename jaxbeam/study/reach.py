@@ -159,7 +159,7 @@ def _problem(
         xp = namespace(end)
         ends.append(to_device(xp.broadcast_to(xp.asarray(end, dtype), (count,))))
     low, high = ends
-    least = np.concatenate([np.full(len(term.nodes), term.kind.commands.low) for term in commanded_terms(scene)])
+    least = np.concatenate([np.full(term.command_count, term.kind.commands.low) for term in commanded_terms(scene)])
     if is_concrete(low, high) and not ((np.asarray(low) > least) & (np.asarray(low) <= np.asarray(high))).all():
         raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
     begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)

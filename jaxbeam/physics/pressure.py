@@ -1,0 +1,123 @@
+"""Pressure on the surface of a body. It stays normal to the surface as that moves.
+
+A pressure `p` pushes a piece `dx` of the surface, which has the body to its left, with `p (-dy, dx)`. On a surface that
+closes a loop, or ends at nodes that do not move, this force has a potential (Schweizerhof and Ramm, Computers &
+Structures 18 (1984), 1099-1114): `p` times the area on the body's side,
+
+    E = p / 2 int (x - c) cross dx,
+
+whatever the point `c`. So the stiffness is symmetric, and the solver needs to know nothing of pressure. On a line with
+an end that moves there is none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace
+from jaxbeam.mesh.elements import edge_products
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.surface import surface
+from jaxbeam.physics.energy import Energy, Term, check_nodes
+
+
+@pytree
+class PressureParams:
+    """Of each edge: pressure `(m,)`, all alike, and centre `(m, 2)`, the point that areas are measured from."""
+
+    pressure: jax.Array
+    centre: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class PressureEnergy(Energy):
+    """`p` times the area between one edge of the surface and the centre. Its command is the pressure."""
+
+    name: ClassVar[str] = "pressure"
+    coordinates: ClassVar[int | None] = 2
+    rest_command: ClassVar[float | None] = 0.0
+    shared_command: ClassVar[bool] = True
+    command_hint: ClassVar[str] = "a pressure pushes on the body, and a negative one pulls"
+
+    def __call__(self, x: jax.Array, params: PressureParams) -> jax.Array:
+        return 0.5 * params.pressure * jnp.sum((x - params.centre) * self._normals(x - params.centre))
+
+    def gradients(self, x: jax.Array, params: PressureParams) -> tuple[jax.Array, jax.Array]:
+        # Those of the energy of one edge depend on the centre, and cancel between neighbours but at the ends of a line.
+        # These are the forces of the pressure on the edge: of their true size, so that residuals are relative to it,
+        # and right at clamped ends, so that reactions are.
+        forces = params.pressure[:, None, None] * self._normals(x)
+        return jax.vmap(self)(x, params), forces
+
+    def _normals(self, x: jax.Array) -> jax.Array:
+        """For each node `(..., k, 2)` of an edge, `int N_i (dy, -dx)`: out of the body, as long as its share."""
+        products = jnp.asarray(edge_products(x.shape[-2]), x.dtype)
+        along = jnp.sum(products[:, :, None] * x[..., None, :, :], axis=-2)
+        return jnp.stack([along[..., 1], -along[..., 0]], axis=-1)
+
+    def command(self, params: PressureParams, values: jax.Array) -> PressureParams:
+        xp = namespace(values)
+        pressure = xp.asarray(values, params.pressure.dtype)
+        return replace(params, pressure=xp.broadcast_to(pressure, params.pressure.shape))
+
+    def command_of(self, params: PressureParams) -> jax.Array:
+        return params.pressure[:1]
+
+    def objection(self, term: Term, fixed: np.ndarray) -> str:
+        starts, ends = (np.bincount(term.nodes[:, k], minlength=len(fixed)) for k in (0, 1))
+        loose = np.flatnonzero((starts != ends) & ~fixed.all(axis=1))
+        if not loose.size:
+            return ""
+        return (
+            f"the line it acts on ends at node {loose[0]}, which moves, so that its force has no potential; choose "
+            f"nodes whose edges close a loop, or end at clamped nodes"
+        )
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        following = {line[0]: line for line in surface(mesh).tolist()}
+        edges = []
+        for start, end in term.nodes[:, :2].tolist():
+            here = start
+            while here != end:
+                edges.append(following[here])
+                here = following[here][1]
+        count = len(edges)
+        centre = jnp.broadcast_to(term.params.centre[0], (count, 2))
+        return Term(self, np.array(edges), PressureParams(jnp.broadcast_to(term.params.pressure[0], (count,)), centre))
+
+
+@usual_rules
+def pressure(mesh: Mesh, nodes: Numbers, value: Numbers = 0.0) -> Term:
+    """Pressure on part of the surface, such as that of a cavity or the upper side of a clamped arch.
+
+    `command` sets it: one command for the whole term.
+
+    Args:
+        mesh: of triangles.
+        nodes: `(m,)` node numbers. It acts on the edges of the surface of which both corners are among them.
+        value: force per length (thickness 1), positive where it pushes on the body; differentiable.
+
+    Raises:
+        ValueError: if a node is out of range, no edge of the surface lies between the nodes, or `value` is not a finite
+            number; and by `Scene`, if the edges form a line with an end that moves.
+    """
+    chosen = check_nodes("nodes", mesh, nodes, ndim=1)
+    value = checks.number("value", value)
+    edges = surface(mesh)
+    edges = edges[np.isin(edges[:, :2], chosen).all(axis=1)]
+    if not len(edges):
+        raise ValueError(
+            f"nodes: expected the corners of at least one edge of the surface, got {chosen.tolist()}; "
+            f"choose them with nodes_where(mesh, ...)"
+        )
+    dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
+    xp = namespace(rest, value)
+    centre = xp.broadcast_to(rest[edges[:, 0]].mean(axis=0), (len(edges), 2))
+    return Term(PressureEnergy(), edges, PressureParams(xp.full(len(edges), xp.asarray(value, dtype)), centre))
