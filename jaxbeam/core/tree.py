@@ -158,6 +158,12 @@ def replace(tree: T, **changes: Any) -> T:
     return new
 
 
+def holds_arrays(tree: Any, one: Any) -> bool:
+    """Whether all leaves, and `one` that must be there, are arrays. JAX makes trees of the same structure of anything,
+    and these must print too."""
+    return all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(tree), one])
+
+
 def is_concrete(*values: Any) -> bool:
     """True if no value is a tracer, so that checks on numbers can run on the host."""
     return not any(isinstance(value, Tracer) for value in values)

@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import (
     Numbers,
+    holds_arrays,
     index_field,
     is_concrete,
     key_of,
@@ -90,8 +92,7 @@ class Scene:
         object.__setattr__(self, "surface", surface_of(bodies))
 
     def __repr__(self) -> str:
-        # JAX builds trees of the same structure from anything.
-        if not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.mesh.nodes]):
+        if not holds_arrays(self, self.mesh.nodes):
             return "Scene(a tree of other values)"
         terms = ", ".join(f"{len(term.nodes)} x {term.kind.name}" for term in self.terms)
         free = f"{int((~self.fixed).sum())} of {self.fixed.size} coordinates free"
@@ -209,6 +210,14 @@ def rest_commands(scene: Scene) -> np.ndarray:
     """The commands `(m,)` under which nothing acts: 1 for a tendon."""
     found = [np.full(term.command_count, term.kind.rest_command) for term in commanded_terms(scene)]
     return np.concatenate([*found, np.zeros(0)]).astype(scene.mesh.nodes.dtype)
+
+
+def command_units(scene: Scene, low: jax.Array, high: jax.Array) -> jax.Array:
+    """What changes of each command `(m,)` are measured in: 1 for ratios, else the width of its bounds `(m,)`."""
+    units = [np.full(term.command_count, term.kind.command_unit, float) for term in commanded_terms(scene)]
+    known = np.concatenate([*units, np.zeros(0)]).astype(low.dtype)
+    width = lax.stop_gradient(high - low)
+    return jnp.where(np.isfinite(known), known, jnp.where(width > 0, width, 1))
 
 
 def partway(scene: Scene, share: jax.Array) -> Scene:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxbeam.core import checks
-from jaxbeam.core.tree import is_concrete, pytree
+from jaxbeam.core.tree import holds_arrays, is_concrete, pytree
 
 
 class Status(enum.IntFlag):
@@ -97,8 +97,7 @@ class Solution:
     status: jax.Array
 
     def __repr__(self) -> str:
-        # JAX builds trees of the same structure from anything.
-        known = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.status])
+        known = holds_arrays(self, self.status)
         if not known or not is_concrete(self.status):
             return f"Solution({'traced' if known else 'a tree of other values'})"
         flags = [Status(int(flag)) for flag in np.ravel(self.status)]

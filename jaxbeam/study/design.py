@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxbeam.core.tree import is_concrete, pytree
+from jaxbeam.core.tree import holds_arrays, is_concrete, pytree
 from jaxbeam.solve.solution import Solution
 
 
@@ -57,7 +57,7 @@ class Design:
     status: jax.Array
 
     def __repr__(self) -> str:
-        known = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(self), self.status])
+        known = holds_arrays(self, self.status)
         if not known or not is_concrete(self.status):
             return f"Design({'traced' if known else 'a tree of other values'})"
         if np.ndim(self.status):

@@ -20,13 +20,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import pytree, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble
-from jaxbeam.scene.scene import Scene, command, commanded_terms, rest_commands, stencil_hessians
+from jaxbeam.scene.scene import Scene, command, command_units, rest_commands, stencil_hessians
 from jaxbeam.solve.equilibrium import differentiable
 from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton
@@ -44,14 +43,6 @@ class Problem:
     low: jax.Array
     high: jax.Array
     tolerance: jax.Array
-
-
-def command_units(problem: Problem) -> jax.Array:
-    """What efforts and steps of each command `(m,)` are measured in: 1 for ratios, else the width of its bounds."""
-    kinds = [term.kind.command_unit for term in commanded_terms(problem.scene) for _ in range(term.command_count)]
-    width = lax.stop_gradient(problem.high - problem.low)
-    known = np.array([np.nan if unit is None else unit for unit in kinds], problem.low.dtype)
-    return jnp.where(np.isfinite(known), known, jnp.where(width > 0, width, 1))
 
 
 class Answer(NamedTuple):
@@ -96,7 +87,7 @@ def follow_optimum(
     """`theta` `(m,)` of the answer itself and the multipliers `(p,)`, which move with the problem and the target
     `(p,)`. The tangents of the answer are ignored."""
     slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
-    unit = command_units(problem)
+    unit = command_units(problem.scene, problem.low, problem.high)
     slope = jnp.where(answer.held == 0, slope * unit, 0)
     gram = slope @ slope.T
     gap = (rest_commands(problem.scene) - answer.theta) / unit
@@ -118,7 +109,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     m, p = answer.theta.size, target.size
     theta, price = follow_optimum(measure, linear, *primals)
     # What is bad stays out of the derivatives of a loss that does not look at it.
-    unit = command_units(problem)
+    unit = command_units(problem.scene, problem.low, problem.high)
     goal = jnp.where(answer.trusted, target, 0)
     theta = jnp.where(answer.trusted, theta, answer.theta)
     price = jnp.where(answer.trusted, price, 0)

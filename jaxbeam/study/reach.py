@@ -16,12 +16,12 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import is_outermost, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device
 from jaxbeam.scene.measures import tip_angle
-from jaxbeam.scene.scene import Scene, command_count, commanded_terms, rest_commands
+from jaxbeam.scene.scene import Scene, command_count, command_units, commanded_terms, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure
-from jaxbeam.study.optimum import Answer, Problem, command_units, move_answer
+from jaxbeam.study.optimum import Answer, Problem, move_answer
 from jaxbeam.study.search import SearchState, Task, Trial, search
 
 # ------------------------------------------------------------------------------------------------ reach
@@ -237,7 +237,7 @@ def _on_host(
             "call them outside jit, vmap and scan; jax.grad, jax.jacfwd and jax.jacrev of them work outside jit"
         )
     known, goals, starts = values
-    unit = np.asarray(command_units(known), float)
+    unit = np.asarray(command_units(known.scene, known.low, known.high), float)
     low, high = np.asarray(known.low, float) / unit, np.asarray(known.high, float) / unit
     count = itertools.count(1)
     task = Task(
