@@ -164,8 +164,6 @@ def corner_slopes(x: Any) -> list[list[Any]]:
     In between they are linear in the barycentric coordinates.
     """
     slopes = _quadratic_slopes(_CORNERS)
-    # From the first node, so that a place far from the origin costs no digits.
-    x = x - x[:1]
     # Python's own numbers leave the dtype of the positions as it is.
     sums = lambda factors: sum(f * x[k] for k, f in enumerate(factors.tolist()) if f)
     return [[sums(slopes[c, :, d]) for d in range(2)] for c in range(3)]

@@ -112,8 +112,8 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     return Line(unit.astype(dtype) * namespace(length).asarray(length, dtype), pairs, to_device(radian, dtype))
 
 
-def aside(x: Any, offset: Any, radian: Any) -> Any:
-    """Vectors `(..., k, 2)` from nodes `x` `(..., k, 3)` of a line to points beside them: `e (-sin theta, cos theta)`.
+def beside(x: Any, offset: Any, radian: Any) -> Any:
+    """Points `(..., k, 2)` beside the nodes `x` `(..., k, 3)` of a line: `(x - e sin theta, y + e cos theta)`.
 
     Args:
         x: positions of the nodes.
@@ -122,4 +122,5 @@ def aside(x: Any, offset: Any, radian: Any) -> Any:
     """
     xp = namespace(x, offset, radian)
     theta = x[..., 2] / radian[..., None]
-    return offset[..., None] * xp.stack([-xp.sin(theta), xp.cos(theta)], axis=-1)
+    normal = xp.stack([-xp.sin(theta), xp.cos(theta)], axis=-1)
+    return x[..., :2] + offset[..., None] * normal

@@ -36,7 +36,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, namespace, pytree
-from jaxbeam.mesh.line import Line, aside
+from jaxbeam.mesh.line import Line, beside
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.physics.energy import Energy, NotRefinable, Term
 from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
@@ -92,8 +92,7 @@ class RodEnergy(Energy):
         raise NotRefinable("a rod has the error of its model, which no finer mesh shows")
 
     def sides(self, x: jax.Array, params: RodParams) -> list[jax.Array]:
-        halves = [jnp.tile(half * params.height[:, None], 2) for half in (0.5, -0.5)]
-        return [x[..., :2] + aside(x, half, params.radian) for half in halves]
+        return [beside(x, jnp.tile(half * params.height[:, None], 2), params.radian) for half in (0.5, -0.5)]
 
 
 # Jitted, so that it is traced once for all of its derivatives.

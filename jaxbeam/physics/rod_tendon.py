@@ -13,10 +13,17 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
-from jaxbeam.mesh.line import Line, aside
+from jaxbeam.mesh.line import Line, beside
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.physics.energy import NotRefinable, Term
-from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, polyline_length, tendons
+from jaxbeam.physics.tendon import (
+    TendonEnergy,
+    TendonParams,
+    from_first,
+    inverse_square_stiffness,
+    polyline_length,
+    tendons,
+)
 
 
 @pytree
@@ -32,8 +39,8 @@ class Offsets:
 
 
 def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
-    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`, measured from the first node."""
-    return (x[..., :2] - x[..., :1, :2]) + aside(x, attachment.eccentricity, attachment.radian)
+    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`."""
+    return beside(x, attachment.eccentricity, attachment.radian)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +91,7 @@ def rod_tendons(
         xp.broadcast_to(xp.asarray(eccentricity, dtype), plain.nodes.shape),
         xp.broadcast_to(xp.asarray(line.radian), plain.nodes.shape[:1]),
     )
-    natural = polyline_length(at_offsets(xp.asarray(line.nodes)[plain.nodes], offsets))
+    natural = polyline_length(at_offsets(from_first(xp.asarray(line.nodes)[plain.nodes]), offsets))
     return Term(
         RodTendonEnergy(stiffness),
         plain.nodes,

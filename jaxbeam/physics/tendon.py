@@ -68,18 +68,14 @@ def check_law(stiffness: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
         checks.scalar("stiffness", form, stiffness, *2 * [jax.ShapeDtypeStruct((), jnp.result_type(float))])
 
 
-# Points of a tendon are measured from its first node: products and sums with places far from the origin would lose the
-# digits that tell the points apart.
-
-
 def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
-    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes, measured from the first."""
-    return x - x[:1]
+    """The points `(k, 2)` of a tendon that is fixed to its `k` nodes."""
+    return x
 
 
 def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
     """The points `(p, 2)` of a tendon that are weighted means, by weights `(p, k)`, of its `k` nodes."""
-    return jnp.sum(attachment[:, :, None] * (x - x[:1]), axis=1)
+    return jnp.sum(attachment[:, :, None] * x, axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +101,7 @@ class TendonEnergy(Energy):
 
     def length(self, x: jax.Array, params: TendonParams) -> jax.Array:
         """Present length `l` `()`."""
-        return polyline_length(self.points(x, params.attachment))
+        return polyline_length(self.points(from_first(x), params.attachment))
 
     def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
         """`dE/dl = k (l - l*)` `()`, positive when it pulls."""
@@ -142,10 +138,16 @@ class TendonEnergy(Energy):
         return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
 
     def line(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        return x[:, :1, :2] + jax.vmap(self.points)(x, params.attachment)
+        return jax.vmap(self.points)(x, params.attachment)[..., :2]
 
     def anchors(self, params: TendonParams) -> tuple[np.ndarray, np.ndarray] | None:
         return None if params.ends is None else (params.ends, np.asarray(params.width))
+
+
+def from_first(x: Any) -> Any:
+    """Nodes `(..., k, d)` with places measured from the first. Points beside nodes, and means of them, would lose the
+    digits that tell them apart if they were computed far from the origin."""
+    return x - x[..., :1, :] * np.array([1.0, 1.0, 0.0], x.dtype)[: x.shape[-1]]
 
 
 def polyline_length(x: jax.Array) -> jax.Array:
@@ -204,9 +206,8 @@ def tendons(
     else:
         nodes_of, weights = _means(mesh, lines, widths)
         energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
-        places = np.asarray(rest)[nodes_of]
-        points = np.einsum("mpk,mkd->mpd", weights, places - places[:, :1])
-        natural = polyline_length(points.astype(dtype))
+        places = from_first(np.asarray(rest)[nodes_of])
+        natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, places).astype(dtype))
     xp = namespace(modulus)
     moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
     return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
