@@ -78,6 +78,7 @@ def test_debug_nans_while_solving():
         jb.check(jb.equilibrium(beam))
 
 
+@pytest.mark.slow
 def test_shard_map():
     """With its check of varying values the answer is an error that names the cure; without it, it works."""
     mesh = jax.make_mesh((1,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))

@@ -157,6 +157,7 @@ def test_smallest_j_in_float32_and_any_unit():
         np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_smallest_jacobian_differentiates():
     """First and second derivatives in positions and rest positions against differences, forward and reverse; where `J`
     is the same everywhere, at rest, they are finite."""
@@ -205,7 +206,7 @@ def test_smallest_jacobian_maps_over_states():
 # --------------------------------------------------------------------------------------------------------- the step
 
 
-@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("size", [1.0, *(pytest.param(size, marks=pytest.mark.slow) for size in (0.1, 10.0))])
 def test_no_part_of_an_element_is_turned_over_within_a_step(size):
     """From any sound state, along any step; and steps are not cut to less than they must be."""
     keep = 0.1

@@ -74,6 +74,7 @@ def test_fibre_is_free_to_contract(density, stretch):
     np.testing.assert_allclose(stress, MATERIALS[density](H + np.eye(2), MU, LAM)[0, 0], atol=1e-13 * LAM)
 
 
+@pytest.mark.slow
 def test_fibre_differentiates_to_third_order_and_in_the_material():
     """Against the same law with the contraction `(lam + mu) a / (mu + lam a^2)` put in."""
 
@@ -205,6 +206,7 @@ def test_scene_at_rest(beam):
     assert jax.tree.structure(beam) == jax.tree.structure(jb.rod_beam(length=2.0))
 
 
+@pytest.mark.slow
 def test_against_finite_elements(turned):
     """Angle within 2 %, length of the tendon within 1.5 % and tension within 6 %: measured 1.6, 1.2 and 5.0."""
     for (scene, solution), (_, angle, length, tension) in zip(turned, FINITE_ELEMENTS, strict=True):

@@ -125,6 +125,7 @@ AT_COMMANDS = {"(0.4, 1.0)": np.zeros(len(KINDS)), "(0.6, 1.0)": 0.2 * np.eye(le
 each_command = pytest.mark.parametrize("steps", AT_COMMANDS.values(), ids=AT_COMMANDS)
 
 
+@pytest.mark.slow
 def test_reference_lengths():
     """By the commanded lengths, degrees per length, as central differences of another code give them."""
     at = expansion(np.zeros(len(KINDS)))
@@ -310,6 +311,7 @@ def angle_slopes(theta, rows, starts):
     return by_theta, by_theta.pop("ratios")
 
 
+@pytest.mark.slow
 def test_ramp_step_by_step():
     """Each step's derivative is that of the equilibrium there; by the end command, its share of the way."""
     end = jnp.array([0.6, 0.9])
@@ -578,7 +580,7 @@ def expected():
 
 # A ramp and a sweep are differentiated by the same function. Third derivatives compile for half a minute; in default
 # runs the rule under them is differentiated thrice in test_rules.py.
-FAST = [("sweep", "fr"), ("checkpointed map", "rr")]
+FAST = [("sweep", "fr")]
 ALL = [(solver, modes) for solver in SOLVED for modes in ("ff", "fr", "rf", "rr", "frr", "rrr", "fff")]
 
 
@@ -619,6 +621,7 @@ def response(v):
 LINEAR = jnp.array([0.8, 1.0, 1.0, 1.0, 0.5])
 
 
+@pytest.mark.slow
 def test_slopes_of_the_linear_response():
     """To second order; the value is that outside of any transformation."""
     v = LINEAR

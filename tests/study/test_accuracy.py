@@ -235,6 +235,7 @@ def mean_pressures(scene, x):
     return pressure, np.abs(pressure[pairs[:, 0]] - pressure[pairs[:, 1]])
 
 
+@pytest.mark.slow
 def test_six_nodes_do_not_lock():
     """At Poisson's ratio 0.4999, where three nodes do not bend at all: within 0.5 % of the limit 9.640, with a pressure
     that is smooth from element to element and of the size of that on the finest meshes, -800 to 300."""

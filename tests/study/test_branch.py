@@ -86,6 +86,7 @@ def test_symmetric_state_loses_stability_between_039_and_038(mirrored, straight,
     assert 1 + fork.parameter * (END[0] - 1) == pytest.approx(fork.ratios[0], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_critical_ratio_by_bisection(mirrored, straight, fork):
     """At each ratio the symmetric state is solved for, and its lowest eigenvalue found, both densely."""
     low, high = 0.38, 0.39
@@ -247,6 +248,7 @@ def test_critical_points_are_equilibria_with_a_null_mode(beam, folded, mirrored,
             assert np.abs(np.asarray(pushed(commanded, point.x, point.shape)))[~scene.fixed].max() < 1e-4
 
 
+@pytest.mark.slow
 def test_coarse_steps_stay_on_the_branch(beam, folded, mirrored, straight):
     for scene, fine in ((beam, folded), (mirrored, straight)):
         last = fine.critical[-1]

@@ -125,6 +125,7 @@ def bent_values(v):
     return jb.lowest_mode(scene, jb.equilibrium(scene, solver=DENSE).x, 2, DENSE).values
 
 
+@pytest.mark.slow
 def test_slopes_of_eigenvalues():
     """By the scene, through the equilibrium, against central differences of step 1e-4, whose truncation
     is about 1e-8. The eigenvectors are accurate to about 1e-7."""
