@@ -36,11 +36,13 @@ class custom_derivative(Generic[T]):
 
     def __init__(self, function: Callable[..., T], static: int = 0) -> None:
         functools.update_wrapper(self, function)
-        self.function, self.static = function, static
+        # Jitted, so that it is traced once for each shape, and not anew by each transformation.
+        self.function, self.static = jax.jit(function, static_argnums=tuple(range(static))), static
+        self._values = functools.lru_cache(maxsize=256)(self._values_of)
         self.rule: Callable[..., tuple[T, T]] | None = None
         self.primitive = Primitive(function.__name__.strip("_"))
         self.primitive.multiple_results = True
-        self.primitive.def_impl(lambda *leaves, **how: jax.jit(self._values(**how))(*leaves))
+        self.primitive.def_impl(lambda *leaves, **how: self._values(**how)(*leaves))
         self.primitive.def_abstract_eval(self._shapes)
         mlir.register_lowering(
             self.primitive,
@@ -62,14 +64,14 @@ class custom_derivative(Generic[T]):
         found = self.primitive.bind(*(jnp.asarray(leaf) for leaf in leaves), static=static, tree=tree, axes=())
         return jax.tree.unflatten(shape, found)
 
-    def _values(self, static: tuple[Any, ...], tree: Any, axes: Axes) -> Callable[..., list[jax.Array]]:
-        """The function from leaves to leaves, mapped over each of the batch `axes`."""
+    def _values_of(self, static: tuple[Any, ...], tree: Any, axes: Axes) -> Callable[..., list[jax.Array]]:
+        """The function from leaves to leaves, mapped over each of the batch `axes`, jitted."""
 
         @usual_rules
         def flat(*leaves: jax.Array) -> list[jax.Array]:
             return jax.tree.leaves(self.function(*static, *jax.tree.unflatten(tree, leaves)))
 
-        return _mapped(flat, axes)
+        return jax.jit(_mapped(flat, axes))
 
     def _shapes(self, *avals: Any, **how: Any) -> list[Any]:
         return jax.make_jaxpr(self._values(**how))(*avals).out_avals
