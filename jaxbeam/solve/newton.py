@@ -34,7 +34,7 @@ SINGULAR = 1.0
 # Rounding far from the origin strains stiff elements, and the tension of these stiffens or softens the body across
 # them. The stiffness is singular too if its lowest eigenvalue is below this many times `eps max|x| / size` times its
 # largest row of magnitudes. Measured on rods and beams in float32, up to 3,000 lengths from the origin: every state
-# that was more than 2e-3 of the body from its equilibrium was below 0.1, and every one above 0.3 within 7e-4.
+# that was more than 2e-3 of the body from its equilibrium was below 0.1, and every one above 0.3 within 1.1e-3.
 FAR = 0.2
 
 
