@@ -349,6 +349,7 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
         sparse = sparse + scipy.sparse.coo_array((hessians.ravel(), places), sparse.shape).tocsr()
     least, bounds, heights, cancelled = _shape(problem, y)
     gradient, sparse = gradient.ravel()[free], sparse[free]
+    square = sparse[:, free]
     return Facts(
         energy=float(energy),
         energy_scale=float(energy_scale),
@@ -357,8 +358,8 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
         gradient=gradient,
         scale=float(scale.ravel()[free].max()),
         scale_sum=float(scale.sum()),
-        hessian=sparse[:, free].toarray() if dense else None,
-        stiffest=float(np.abs(sparse[:, free].diagonal()).max()),
+        hessian=square.toarray() if dense else None,
+        stiffest=float(np.abs(square.diagonal()).max()),
         longest_row=float(np.sqrt(np.asarray(sparse.multiply(sparse).sum(axis=1))).max()),
         volumes=least,
         bounds=bounds,

@@ -82,7 +82,7 @@ def reach(
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    goal = _numbers("target", target)
+    goal = _known_or_traced("target", target)
     if goal.shape != shape:
         raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
     goal = jnp.asarray(goal, scene.mesh.nodes.dtype)
@@ -113,7 +113,7 @@ def reach_each(
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
-    goals = _numbers("targets", targets)
+    goals = _known_or_traced("targets", targets)
     if goals.ndim != len(shape) + 1 or goals.shape[1:] != shape or not goals.shape[0]:
         rows = f"(T, {shape[0]})" if shape else "(T,)"
         raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
@@ -169,7 +169,7 @@ def _problem(
     return problem, begin
 
 
-def _numbers(name: str, target: Numbers) -> Any:
+def _known_or_traced(name: str, target: Numbers) -> Any:
     """Targets, checked. A traced one may be NaN: its search fails, and harms the derivative of no other."""
     return checks.numbers(name, target) if is_concrete(target) else checks.real(name, target)
 

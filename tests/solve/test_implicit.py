@@ -579,7 +579,7 @@ def expected():
 
 
 # A ramp and a sweep are differentiated by the same function. Third derivatives compile for half a minute; in default
-# runs the rule under them is differentiated thrice in test_rules.py.
+# runs the rule under them is differentiated thrice in tests/core/test_derivative.py.
 FAST = [("sweep", "fr")]
 ALL = [(solver, modes) for solver in SOLVED for modes in ("ff", "fr", "rf", "rr", "frr", "rrr", "fff")]
 

@@ -148,7 +148,7 @@ def assert_claims_hold(drawn: Drawn) -> None:
 QUIET = {"deadline": None, "derandomize": True, "suppress_health_check": list(HealthCheck), "database": None}
 
 
-@settings(max_examples=100, **QUIET)
+@settings(max_examples=200, **QUIET)
 @given(scenes(PROGRAMS))
 def test_claims_of_random_scenes_hold(drawn):
     assert_claims_hold(drawn)
