@@ -86,6 +86,18 @@ def _without_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
+def _rules_are_usual() -> bool:
+    """Whether JAX's default rules for ranks, dtypes and transfers hold here."""
+    now = jax.config
+    return (
+        now.jax_numpy_rank_promotion == "allow"
+        and now.jax_numpy_dtype_promotion == "standard"
+        and now.jax_transfer_guard_host_to_device in (None, "allow")
+        and now.jax_transfer_guard_device_to_device in (None, "allow")
+        and now.jax_transfer_guard_device_to_host in (None, "allow")
+    )
+
+
 def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: run under JAX's default rules for ranks, dtypes and transfers, whatever the user has set.
 
@@ -95,6 +107,9 @@ def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> T:
+        # Mostly nothing is to be changed, and to enter three contexts takes as long as all checks of arguments.
+        if _rules_are_usual():
+            return function(*arguments, **named)
         with (
             jax.numpy_rank_promotion("allow"),
             jax.numpy_dtype_promotion("standard"),

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.core.compiling import compute_if
 from jaxbeam.mesh.elements import edge_functions
 from jaxbeam.scene.scene import Scene
 
@@ -27,6 +28,16 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
     points, ids, edges = (jnp.concatenate(each) for each in zip(*segments, strict=True))
     if not len(points):
         return jnp.full((2, 2), -1, jnp.int32)
+    joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
+    low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
+    near = jnp.all((low[:, None] <= high[None, :]) & (low[None, :] <= high[:, None]), axis=2) & ~joined
+    none = jnp.full((2, 2), -1, jnp.int32)
+    # In most states no boxes around two segments meet, and nothing else is computed.
+    return compute_if(jnp.any(near), _first_crossing, none, points, edges, near)
+
+
+def _first_crossing(points: jax.Array, edges: jax.Array, near: jax.Array) -> jax.Array:
+    """The edges of the first two segments that cross, of those pairs `(s, s)` that are `near`."""
     start, along = points[:, 0], points[:, 1] - points[:, 0]
 
     def sides(which: int) -> jax.Array:
@@ -35,11 +46,8 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
         return along[:, None, 0] * gap[..., 1] - along[:, None, 1] * gap[..., 0]
 
     apart = sides(0) * sides(1) < 0
-    joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
-    # Of segments in one line round-off decides the sides. Those that lie one after the other do not meet.
-    low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
-    near = jnp.all(low[:, None] <= high[None, :], axis=2)
-    crossed = (apart & apart.T & near & near.T & ~joined).ravel()
+    # Of segments in one line round-off decides the sides. Those that lie one after the other are not near.
+    crossed = (apart & apart.T & near).ravel()
     first = jnp.argmax(crossed)
     pair = edges[jnp.stack([first // len(points), first % len(points)])]
     return jnp.where(crossed[first], pair, -1)
@@ -51,7 +59,7 @@ def _of_solids(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     parts = 1 if edges.shape[1] == 2 else SEGMENTS
     xi = np.linspace(0, 1, parts + 1)
     functions = edge_functions(edges.shape[1], xi)
-    curves = jnp.einsum("pk,ekd->epd", jnp.asarray(functions, x.dtype), x[edges, :2])
+    curves = sum(function[:, None] * x[edges[:, k], :2][:, None] for k, function in enumerate(jnp.asarray(functions.T, x.dtype)))
     # Points between the ends of an edge are numbered after the nodes.
     between = len(x) + jnp.arange(len(edges) * (parts - 1), dtype=jnp.int32).reshape(len(edges), parts - 1)
     numbers = jnp.concatenate([edges[:, :1], between, edges[:, 1:2]], axis=1)

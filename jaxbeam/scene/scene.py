@@ -164,8 +164,7 @@ def command(scene: Scene, commands: Numbers) -> Scene:
         ValueError: if the count is wrong or a concrete command is out of its range, as a ratio that is not positive.
     """
     check_scene(scene)
-    values = checks.shaped("ratios", commands, ((command_count(scene),),), "one for each tendon")
-    check_commands("ratios", scene, values)
+    values = checked_commands("ratios", scene, commands)
     terms, start = [], 0
     for term in scene.terms:
         if term.kind.rest_command is not None:
@@ -173,6 +172,13 @@ def command(scene: Scene, commands: Numbers) -> Scene:
             term, start = replace(term, params=term.kind.command(term.params, values[start:stop])), stop
         terms.append(term)
     return replace(scene, terms=tuple(terms))
+
+
+def checked_commands(name: str, scene: Scene, commands: Numbers) -> Any:
+    """Commands `(m,)` of a scene as numbers; refused if their count is wrong, or as `check_commands` does."""
+    values = checks.shaped(name, commands, ((command_count(scene),),), "one for each tendon")
+    check_commands(name, scene, values)
+    return values
 
 
 def check_commands(name: str, scene: Scene, values: Any) -> None:

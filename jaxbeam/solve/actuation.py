@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.core.tree import to_device
 from jaxbeam.scene.scene import Scene, command, commands_of, partway, rest_commands
 
 
@@ -33,11 +35,18 @@ class Origin(NamedTuple):
 def from_rest(scene: Scene, x: Any = None) -> Origin:
     """The origin without any actuation or load. The first attempt starts at `x`, by default at rest.
 
-    It is made of NumPy's arrays: arithmetic with JAX would compile a program for each shape.
+    It is made without arithmetic, for which JAX would compile a program for each shape.
     """
     rest = scene.mesh.nodes
-    none = np.zeros(rest.shape, rest.dtype)
-    return Origin(rest_commands(scene), none[0, 0], rest, none, np.int32(0), rest if x is None else x)
+    zeros = partial(_zeros, dtype=rest.dtype)
+    first = rest if x is None else x
+    return Origin(rest_commands(scene), zeros(()), rest, zeros(rest.shape), _zeros((), np.dtype(np.int32)), first)
+
+
+@lru_cache(maxsize=64)
+def _zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    """Zeros on the device, kept: to send NumPy's there takes longer than the rest of a call."""
+    return to_device(np.zeros(shape, dtype))
 
 
 def from_neighbour(commands: Any, x: Any, ahead: Any) -> Origin:

@@ -11,7 +11,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout
-from jaxbeam.scene.scene import Scene, command, rest_commands
+from jaxbeam.scene.scene import Scene, checked_commands, command, rest_commands
 from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
@@ -72,8 +72,7 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     check_scene_and_solver(scene, solver)
     checks.count("steps", steps, 2)
     check_held(scene)
-    command(scene, ratios)  # checks the ratios
-    end = to_device(checks.real("ratios", ratios), scene.mesh.nodes.dtype)
+    end = to_device(checked_commands("ratios", scene, ratios), scene.mesh.nodes.dtype)
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     if is_concrete(end, *jax.tree.leaves(scene)):
         return _ramp(open_scene, layout, end, steps, solver)
