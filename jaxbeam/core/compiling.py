@@ -88,14 +88,10 @@ def _without_garbage_collection() -> Iterator[None]:
 
 def _rules_are_usual() -> bool:
     """Whether JAX's default rules for ranks, dtypes and transfers hold here."""
-    now = jax.config
-    return (
-        now.jax_numpy_rank_promotion == "allow"
-        and now.jax_numpy_dtype_promotion == "standard"
-        and now.jax_transfer_guard_host_to_device in (None, "allow")
-        and now.jax_transfer_guard_device_to_device in (None, "allow")
-        and now.jax_transfer_guard_device_to_host in (None, "allow")
-    )
+    ways = ("host_to_device", "device_to_device", "device_to_host")
+    guards = {getattr(jax.config, f"jax_transfer_guard_{way}") for way in ways}
+    ranks, dtypes = (getattr(jax.config, f"jax_numpy_{kind}_promotion") for kind in ("rank", "dtype"))
+    return ranks == "allow" and dtypes == "standard" and guards <= {None, "allow"}
 
 
 def usual_rules(function: Callable[P, T]) -> Callable[P, T]:

@@ -59,7 +59,9 @@ def _of_solids(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     parts = 1 if edges.shape[1] == 2 else SEGMENTS
     xi = np.linspace(0, 1, parts + 1)
     functions = edge_functions(edges.shape[1], xi)
-    curves = sum(function[:, None] * x[edges[:, k], :2][:, None] for k, function in enumerate(jnp.asarray(functions.T, x.dtype)))
+    curves = sum(
+        function[:, None] * x[edges[:, k], :2][:, None] for k, function in enumerate(jnp.asarray(functions.T, x.dtype))
+    )
     # Points between the ends of an edge are numbered after the nodes.
     between = len(x) + jnp.arange(len(edges) * (parts - 1), dtype=jnp.int32).reshape(len(edges), parts - 1)
     numbers = jnp.concatenate([edges[:, :1], between, edges[:, 1:2]], axis=1)

@@ -44,12 +44,14 @@ class Stiffness(NamedTuple):
     factor: positive definite Cholesky factor: of the true Hessian if `definite`, else of a modified one.
     definite: `()` whether the true Hessian is positive definite.
     marginal: `()` whether round-off decided that, so that its sign is unknown.
+    pivot: `()` the smallest pivot of the factor.
     rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`.
     """
 
     factor: Any
     definite: jax.Array
     marginal: jax.Array
+    pivot: jax.Array
     rows: jax.Array
 
 
@@ -101,10 +103,10 @@ def factorise(
     begin = (jnp.zeros((), jnp.int32), zero_factor(layout, storage.dtype, linear), ~finite, jnp.zeros_like(storage))
     going = lambda c: (c[0] == 0) | (~c[2] & finite & (c[0] < first_blend + MAX_BLENDS))
     tries, factor, done, _ = lax.while_loop(going, attempt, begin)
-    smallest_pivot = jnp.min(linear.pivots(layout, factor) / diagonal)
-    small = smallest_pivot <= PIVOT_ROUND_OFF * round_off
+    pivots = jnp.where(layout.slots < layout.position.size, linear.pivots(layout, factor), jnp.inf)
+    small = jnp.min(pivots / diagonal) <= PIVOT_ROUND_OFF * round_off
     marginal = done & ((tries == 2) | ((tries == 1) & small))
-    return Stiffness(factor, done & (tries == 1), marginal, row_magnitudes(scene, hessians))
+    return Stiffness(factor, done & (tries == 1), marginal, jnp.min(pivots), row_magnitudes(scene, hessians))
 
 
 def _modification(

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.core.tree import unlock
+from jaxbeam.linear.layout import assemble
 from jaxbeam.mesh.line import Line
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
+from jaxbeam.scene.scene import evaluate, stencil_hessians
+from jaxbeam.solve.newton import SOFT_PIVOT, topology
+from jaxbeam.solve.residual import row_magnitudes
 
 NX, NY = 9, 5
 
@@ -122,7 +127,9 @@ def test_rounding_far_away_pretends_tension():
     shift = np.asarray(scene.mesh.nodes[4]) - np.asarray(centred.mesh.nodes[4])
     off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max(axis=(1, 2)) / 3.5
     assert (off > 5e-3).any()
-    assert np.all((np.asarray(found.status) == jb.Status.INACCURATE) | (off < 2e-3))
+    # Rounding may also make a stiffness indefinite that is not, which is then UNSTABLE.
+    assert np.all((np.asarray(found.status) != 0) | (off < 2e-3))
+    assert np.mean(np.asarray(found.status) == jb.Status.INACCURATE) > 0.9
 
 
 # ------------------------------------------------------------------------------------------ limits of stability
@@ -176,3 +183,30 @@ def test_a_slope_beside_a_bifurcation_keeps_its_symmetry(mirrored, fork):
     scale = float(jnp.abs(one_sided(jnp.array([ratio, ratio]))).max())
     assert scale > 1e7
     assert abs(float(jax.grad(angle)(jnp.asarray(ratio)))) < 1e-6 * scale
+
+
+@pytest.mark.parametrize("share", [1e-14, 1e-12, 1e-10])
+@pytest.mark.parametrize("held", ["end", "both ends", "corners"])
+@pytest.mark.parametrize("solver", [jb.BlockTridiagonal(), jb.Dense()], ids=["blocks", "dense"])
+def test_a_singular_matrix_has_a_small_pivot(held, solver, share):
+    """The lowest eigenvalue is looked for only where one is; also modes that leave the last nodes alone have one."""
+    mesh = jb.rectangle(20.0, 0.8, 41, 3)
+    x, y = np.asarray(mesh.nodes).T
+    ends = {"end": x == x.min(), "both ends": abs(x) == x.max(), "corners": (abs(x) == x.max()) & (y == y.min())}
+    scene = unlock(jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e4, 0.45)),), jb.clamped(mesh, np.flatnonzero(ends[held]))))
+    hessians = stencil_hessians(scene, scene.mesh.nodes)
+    largest = float(jnp.max(row_magnitudes(scene, hessians)))
+    layout = solver.layout(topology(scene))
+    storage = assemble(layout, hessians)
+
+    unknown = np.flatnonzero(np.asarray(layout.slots) < x.size * 2)
+    columns = jax.vmap(lambda v: jax.jvp(lambda x: evaluate(scene, x).gradient, (scene.mesh.nodes,), (v,))[1].ravel())
+    free = np.flatnonzero(~np.asarray(scene.fixed).ravel())
+    matrix = np.asarray(columns(jnp.eye(2 * x.size)[free].reshape(-1, x.size, 2)))[:, free]
+    lowest = np.linalg.eigvalsh(matrix)[0]
+
+    shifted = storage.at[layout.diagonal[unknown]].add(share * largest - lowest)
+    factor, definite = solver.factor(layout, shifted)
+    assert definite
+    pivot = float(jnp.min(solver.pivots(layout, factor)[unknown]))
+    assert share * largest * 0.99 <= pivot < 0.1 * SOFT_PIVOT * share**0.5 * largest
