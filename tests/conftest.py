@@ -1,5 +1,6 @@
 """Settings and scenes that the tests share. Each new scene shape compiles for seconds, so few shapes are used."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -16,13 +17,23 @@ import jaxbeam as jb
 from jaxbeam.core.compiling import COMPILER_OPTIONS
 
 # Nearly all of the time here is compilation: what the library asks for its own programs is asked for all others as
-# well, and LLVM optimises none. XLA reads it when the first one is compiled. Benchmarks verify what is optimised.
-options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True, **(COMPILER_OPTIONS or {})}
+# well, and LLVM optimises none, in one piece: the other core has tests of its own. XLA reads it when the first one is
+# compiled. Benchmarks verify what is optimised.
+options = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_parallel_codegen_split_count": 1,
+    **(COMPILER_OPTIONS or {}),
+}
 os.environ["XLA_FLAGS"] = " ".join(
     [os.environ.get("XLA_FLAGS", ""), *(f"--{name}={str(value).lower()}" for name, value in options.items())]
 )
 
 jax.config.update("jax_enable_x64", True)
+
+# Python's search for reference cycles takes a tenth of the time of tracing. What is loaded now stays anyway.
+gc.freeze()
+gc.set_threshold(100_000, 50, 1000)
 
 
 @pytest.fixture(scope="session")

@@ -76,12 +76,15 @@ def material_is_valid(material: Any) -> Any:
     return jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
 
 
-def distortion(H: jax.Array) -> jax.Array:
-    """`(|F|^2 - 2) / 2 - (J - 1)`, as half a sum of squares: zero where `F` only turns and stretches evenly.
+def distortion_and_volume(H: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`(|F|^2 - 2) / 2 - (J - 1)` and `J - 1`.
 
-    Summed up term by term it would lose, in a body that turns, the digits of a small strain.
+    The first is half a sum of squares, zero where `F` only turns and stretches evenly. Summed up term by term it would
+    lose, in a body that turns, the digits of a small strain.
     """
-    return 0.5 * ((H[0, 0] - H[1, 1]) ** 2 + (H[0, 1] + H[1, 0]) ** 2)
+    # Each entry is taken once: all derivatives repeat it.
+    a, b, c, d = H[0, 0], H[0, 1], H[1, 0], H[1, 1]
+    return 0.5 * ((a - d) ** 2 + (b + c) ** 2), a + d + (a * d - b * c)
 
 
 def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
@@ -92,8 +95,8 @@ def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
 
     Source: Macklin and Mueller, "A constraint-based formulation of stable neo-Hookean materials", MIG 2021.
     """
-    volume = H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
-    return params.mu * distortion(H) + 0.5 * params.lam * volume**2
+    distortion, volume = distortion_and_volume(H)
+    return params.mu * distortion + 0.5 * params.lam * volume**2
 
 
 def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
@@ -103,9 +106,9 @@ def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
 
     Source: Bonet and Wood, "Nonlinear Continuum Mechanics for Finite Element Analysis", 2008, eq. 6.27.
     """
-    volume = H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+    distortion, volume = distortion_and_volume(H)
     log_j = jnp.log1p(volume)
-    return params.mu * (distortion(H) + _less_log1p(volume)) + 0.5 * params.lam * log_j**2
+    return params.mu * (distortion + _less_log1p(volume)) + 0.5 * params.lam * log_j**2
 
 
 @jax.custom_jvp

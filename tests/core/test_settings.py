@@ -78,16 +78,23 @@ def test_debug_nans_while_solving():
         jb.check(jb.equilibrium(beam))
 
 
-@pytest.mark.slow
-def test_shard_map():
-    """With its check of varying values the answer is an error that names the cure; without it, it works."""
+def spread(**how):
     mesh = jax.make_mesh((1,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))
-    spread = lambda **how: jax.shard_map(
-        jax.vmap(angle), mesh=mesh, in_specs=PartitionSpec("d"), out_specs=PartitionSpec("d"), **how
-    )
+    rows = PartitionSpec("d")
+    return jax.shard_map(jax.vmap(angle), mesh=mesh, in_specs=rows, out_specs=rows, **how)
+
+
+def test_shard_map():
+    """With its check of varying values the answer is an error that names the cure; without it, it traces."""
     rows = jnp.asarray(BENT[None])
     with pytest.raises(ValueError, match="check_vma=False"):
-        spread()(rows)
+        jax.eval_shape(spread(), rows)
+    assert jax.eval_shape(spread(check_vma=False), rows).shape == (1,)
+
+
+@pytest.mark.slow
+def test_shard_map_is_right():
+    rows = jnp.asarray(BENT[None])
     np.testing.assert_allclose(spread(check_vma=False)(rows), angle(rows[0])[None], rtol=1e-12)
 
 

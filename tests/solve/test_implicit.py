@@ -654,3 +654,12 @@ def test_no_slope_of_a_linear_response_that_is_unstable():
     shared = jit(jax.grad(lambda factor: jax.vmap(place)(factor * both)[0]))(1.0)
     np.testing.assert_allclose(shared, 0.9 * jit(jax.grad(place))(0.9), rtol=1e-12)
     assert np.isfinite(shared)
+
+
+def test_slopes_of_a_linear_response_of_springs():
+    """To second order, and `lax.map` changes nothing."""
+    place = lambda ratio: jb.linear_response(jb.command(PAIR, jnp.stack([ratio, 0.9 * ratio])))[2, 0]
+    slope = jit(jax.grad(place))
+    assert slope(0.8) == pytest.approx(differences(lambda t: place(0.8 + t), 1e-3), rel=FIRST)
+    curvature = jit(jax.grad(jax.grad(lambda ratio: jax.lax.map(place, ratio[None])[0])))(jnp.asarray(0.8))
+    assert curvature == pytest.approx(differences(lambda t: slope(0.8 + t), 1e-3), rel=SECOND)
