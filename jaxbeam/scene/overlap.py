@@ -26,12 +26,12 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
     do. Edges that share a node do not count: `J` says whether these fold over."""
     segments = [_of_solids(scene, x), *_of_sides(scene, x)]
     points, ids, edges = (jnp.concatenate(each) for each in zip(*segments, strict=True))
+    none = jnp.full((2, 2), -1, jnp.int32)
     if not len(points):
-        return jnp.full((2, 2), -1, jnp.int32)
+        return none
     joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
     low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
     near = jnp.all((low[:, None] <= high[None, :]) & (low[None, :] <= high[:, None]), axis=2) & ~joined
-    none = jnp.full((2, 2), -1, jnp.int32)
     # In most states no boxes around two segments meet, and nothing else is computed.
     return compute_if(jnp.any(near), _first_crossing, none, points, edges, near)
 
