@@ -103,7 +103,7 @@ def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> T:
-        # Mostly nothing is to be changed, and to enter three contexts takes as long as all checks of arguments.
+        # Mostly nothing is to be changed, and to enter three contexts takes longer than the checks of arguments.
         if _rules_are_usual():
             return function(*arguments, **named)
         with (

@@ -45,7 +45,7 @@ def from_rest(scene: Scene, x: Any = None) -> Origin:
 
 @lru_cache(maxsize=64)
 def _zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
-    """Zeros on the device, kept: to send NumPy's there takes longer than the rest of a call."""
+    """Zeros on the device, kept: to send NumPy's there took a third of the time in which a call returns."""
     return to_device(np.zeros(shape, dtype))
 
 
