@@ -132,12 +132,12 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
         inner = jax.jit(traced, static_argnames=static)
         outermost = jax.jit(traced, static_argnames=static, compiler_options=COMPILER_OPTIONS)
-        signature = inspect.signature(function)
+        names = tuple(inspect.signature(function).parameters)
 
         @functools.wraps(function)
         @usual_rules
         def call(*arguments: Any, **named: Any) -> T:
-            values = signature.bind(*arguments, **named).arguments
+            values = dict(zip(names, arguments, strict=False)) | named
             settings = {name: values.pop(name) for name in static}
             if is_concrete(*jax.tree.leaves(values)) and is_outermost():
                 with _without_garbage_collection():

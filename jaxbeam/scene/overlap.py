@@ -9,6 +9,8 @@ them. A rod's surface is the pair of lines at half its height on either side of 
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,11 +31,21 @@ def crossing(scene: Scene, x: jax.Array) -> jax.Array:
     none = jnp.full((2, 2), -1, jnp.int32)
     if not len(points):
         return none
-    joined = jnp.any(ids[:, None, :, None] == ids[None, :, None, :], axis=(2, 3))
-    low, high = jnp.min(points, axis=1), jnp.max(points, axis=1)
-    near = jnp.all((low[:, None] <= high[None, :]) & (low[None, :] <= high[:, None]), axis=2) & ~joined
+    near = _near(jnp.min(points, axis=1), jnp.max(points, axis=1), ids)
     # In most states no boxes around two segments meet, and nothing else is computed.
     return compute_if(jnp.any(near), _first_crossing, none, points, edges, near)
+
+
+def _near(low: jax.Array, high: jax.Array, ids: jax.Array) -> jax.Array:
+    """The pairs of segments `(s, s)` that share no point and whose boxes, `low` to `high` `(s, 2)`, meet."""
+    # Every state asks this of every pair. Column by column, because XLA vectorises no sum over a short axis.
+    near = jnp.ones((len(ids), len(ids)), bool)
+    for axis in range(2):
+        below = low[:, None, axis] <= high[None, :, axis]
+        near &= below & below.T
+    for mine, other in itertools.product(range(2), repeat=2):
+        near &= ids[:, None, mine] != ids[None, :, other]
+    return near
 
 
 def _first_crossing(points: jax.Array, edges: jax.Array, near: jax.Array) -> jax.Array:

@@ -128,7 +128,7 @@ def check_scene(scene: Scene) -> None:
     """Refuse what is not a scene."""
     checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
     dtype = scene.mesh.nodes.dtype
-    if dtype == np.float64 and jnp.result_type(float) != dtype:
+    if jax.dtypes.canonicalize_dtype(dtype) != dtype:
         raise ValueError(
             "scene: its nodes are float64, which JAX computes with only where jax_enable_x64 is on; set "
             'jax.config.update("jax_enable_x64", True), or build the scene with dtype=jnp.float32'

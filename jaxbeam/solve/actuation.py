@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -38,15 +38,21 @@ def from_rest(scene: Scene, x: Any = None) -> Origin:
     It is made without arithmetic, for which JAX would compile a program for each shape.
     """
     rest = scene.mesh.nodes
-    zeros = partial(_zeros, dtype=rest.dtype)
-    first = rest if x is None else x
-    return Origin(rest_commands(scene), zeros(()), rest, zeros(rest.shape), _zeros((), np.dtype(np.int32)), first)
+    at_rest = rest_commands(scene)
+    return Origin(
+        commands=_kept(tuple(at_rest.tolist()), at_rest.shape, rest.dtype),
+        loaded=_kept(0, (), rest.dtype),
+        x=rest,
+        ahead=_kept(0, rest.shape, rest.dtype),
+        known=_kept(0, (), np.dtype(np.int32)),
+        first=rest if x is None else x,
+    )
 
 
 @lru_cache(maxsize=64)
-def _zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
-    """Zeros on the device, kept: to send NumPy's there took a third of the time in which a call returns."""
-    return to_device(np.zeros(shape, dtype))
+def _kept(values: float | tuple[float, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    """Numbers on the device, kept: to send NumPy's there took a third of the time in which a call returns."""
+    return to_device(np.broadcast_to(np.asarray(values, dtype), shape))
 
 
 def from_neighbour(commands: Any, x: Any, ahead: Any) -> Origin:

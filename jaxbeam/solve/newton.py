@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
@@ -27,20 +26,7 @@ from jaxbeam.linear.tridiagonal import BlockTridiagonal
 from jaxbeam.scene.scene import Evaluation, Scene, check_scene, evaluate, extent
 from jaxbeam.solve.line_search import line_search
 from jaxbeam.solve.residual import force_round_off, force_scale, relative_residual
-from jaxbeam.solve.stiffness import Stiffness, factorise, zero_factor
-
-# The stiffness is singular if its lowest eigenvalue is below this many eps times its largest row of magnitudes.
-SINGULAR = 1.0
-# Rounding far from the origin strains stiff elements, and the tension of these stiffens or softens the body across
-# them. The stiffness is singular too if its lowest eigenvalue is below this many times `eps max|x| / size` times its
-# largest row of magnitudes. Measured on rods and beams in float32, up to 3,000 lengths from the origin: every state
-# that was more than 2e-3 of the body from its equilibrium was below 0.1, and every one above 0.3 within 1.1e-3.
-FAR = 0.2
-# A matrix whose lowest eigenvalue is the share `t` of its largest row has a pivot of less than 1,000 sqrt(t) times that
-# row: measured with `t` from 1e-15 to 1e-3 on beams and rods held in five ways, also with elements a million times
-# softer than others. So the eigenvalue is looked for only where a pivot is less than this many times sqrt(t).
-SOFT_PIVOT = 1e4
-
+from jaxbeam.solve.stiffness import Stiffness, factorise, is_singular, zero_factor
 
 # A step shorter than this, over the size of the body, changes the stiffness of the softest mode by as small a share, so
 # its factor may be reused.
@@ -214,7 +200,7 @@ def newton(
     problem = Problem(scene, layout, policy, solver, extent(scene))
     begin = init(problem, x, displacement)
     end = lax.while_loop(lambda state: state.running, partial(step, problem), begin)
-    return end._replace(singular=_is_singular(problem, end.x, end.stiffness))
+    return end._replace(singular=is_singular(scene, layout, end.x, problem.size, end.stiffness, solver.linear))
 
 
 def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
@@ -225,7 +211,7 @@ def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
     return State(
         x=x,
         evaluation=Evaluation(zero, zero, zeros, zeros),
-        stiffness=Stiffness(factor, yes, ~yes, zero, zeros),
+        stiffness=Stiffness(factor, yes, ~yes, zero, zero, zeros),
         step=displacement,
         response=zeros,
         correction=zero,
@@ -246,11 +232,14 @@ def step(problem: Problem, state: State) -> State:
         scene, state.x, state.evaluation, state.step, state.initial, full, solver.keep_volume
     )
     unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, evaluation.gradient)))
-    balanced = unbalanced <= rtol * force_scale(scene, evaluation)
+    allowed = rtol * force_scale(scene, evaluation)
+    balanced = unbalanced <= allowed
 
     reuse, renew = _reuse(problem, state, balanced)
-    stiffness_at = lambda x, finite: factorise(scene, problem.layout, x, finite, policy.leaving_saddle, solver.linear)
-    stiffness = compute_if(renew, stiffness_at, state.stiffness, x, jnp.isfinite(unbalanced))
+    stiffness_at = lambda x, unbalanced, allowed: factorise(
+        scene, problem.layout, x, problem.size, unbalanced, allowed, policy.leaving_saddle, solver.linear
+    )
+    stiffness = compute_if(renew, stiffness_at, state.stiffness, x, unbalanced, allowed)
     residual = relative_residual(scene, evaluation, force_round_off(stiffness.rows, x), rtol)
     next_step, response = _solve(problem, state, x, evaluation, stiffness, reuse)
     correction = jnp.max(jnp.abs(next_step)) / problem.size
@@ -332,24 +321,6 @@ def _solve(
     moves = problem.solver.linear.solve(problem.layout, stiffness.factor, loads)
     moves = jax.vmap(lambda move: expand(problem.layout, -move, x.shape), in_axes=1)(moves)
     return moves[0], response + moves[1]
-
-
-def _is_singular(problem: Problem, x: jax.Array, stiffness: Stiffness) -> jax.Array:
-    """Whether the lowest eigenvalue of a definite stiffness at `x` is within its round-off, `()`."""
-    signs = jnp.asarray(np.random.default_rng(1).choice([-1.0, 1.0], x.shape), x.dtype)
-    load = gather(problem.layout, jnp.where(problem.scene.fixed, 0, signs))
-
-    def softest(factor: Any) -> jax.Array:
-        """Rayleigh quotient of one inverse iteration: near a limit of stability it is the lowest eigenvalue."""
-        move = problem.solver.linear.solve(problem.layout, factor, load)
-        return jnp.sum(load * move) / jnp.sum(move**2)
-
-    far = FAR * jnp.max(jnp.abs(x)) / problem.size
-    share = float(jnp.finfo(x.dtype).eps) * jnp.maximum(SINGULAR, far)
-    largest = jnp.max(stiffness.rows)
-    soft = stiffness.definite & (stiffness.pivot <= SOFT_PIVOT * jnp.sqrt(share) * largest)
-    lowest = compute_if(soft, softest, jnp.asarray(jnp.inf, x.dtype), stiffness.factor)
-    return lowest <= share * largest
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:

@@ -12,8 +12,8 @@ from jaxbeam.mesh.line import Line
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
 from jaxbeam.scene.scene import evaluate, stencil_hessians
-from jaxbeam.solve.newton import SOFT_PIVOT, topology
-from jaxbeam.solve.residual import row_magnitudes
+from jaxbeam.solve.newton import topology
+from jaxbeam.solve.stiffness import SOFT_PIVOT, largest_diagonal
 
 NX, NY = 9, 5
 
@@ -127,9 +127,8 @@ def test_rounding_far_away_pretends_tension():
     shift = np.asarray(scene.mesh.nodes[4]) - np.asarray(centred.mesh.nodes[4])
     off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max(axis=(1, 2)) / 3.5
     assert (off > 5e-3).any()
-    # Rounding may also make a stiffness indefinite that is not, which is then UNSTABLE.
-    assert np.all(np.isin(found.status, [jb.Status.INACCURATE, jb.Status.UNSTABLE]) | (off < 2e-3))
-    assert np.mean(np.asarray(found.status) == jb.Status.INACCURATE) > 0.9
+    # Rounding may also make a stiffness indefinite that is not.
+    assert np.all((np.asarray(found.status) == jb.Status.INACCURATE) | (off < 2e-3))
 
 
 # ------------------------------------------------------------------------------------------ limits of stability
@@ -194,10 +193,9 @@ def test_a_singular_matrix_has_a_small_pivot(held, solver, share):
     x, y = np.asarray(mesh.nodes).T
     ends = {"end": x == x.min(), "both ends": abs(x) == x.max(), "corners": (abs(x) == x.max()) & (y == y.min())}
     scene = unlock(jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e4, 0.45)),), jb.clamped(mesh, np.flatnonzero(ends[held]))))
-    hessians = stencil_hessians(scene, scene.mesh.nodes)
-    largest = float(jnp.max(row_magnitudes(scene, hessians)))
     layout = solver.layout(topology(scene))
-    storage = assemble(layout, hessians)
+    storage = assemble(layout, stencil_hessians(scene, scene.mesh.nodes))
+    largest = float(largest_diagonal(layout, storage))
 
     unknown = np.flatnonzero(np.asarray(layout.slots) < x.size * 2)
     columns = jax.vmap(lambda v: jax.jvp(lambda x: evaluate(scene, x).gradient, (scene.mesh.nodes,), (v,))[1].ravel())
