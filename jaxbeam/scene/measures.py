@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.compiling import one_program
 from jaxbeam.mesh.elements import Element, degree_of, element_of, rule
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene, placed
 
 
-@usual_rules
+@one_program
 def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
     """Deflection of the tip `()` in degrees, `atan2(mean transverse displacement of the tip, length)`.
 
@@ -41,7 +41,7 @@ def tip_angle(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.rad2deg(jnp.arctan2(along[0] * moved[1] - along[1] * moved[0], length))
 
 
-@usual_rules
+@one_program
 def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     """Mean position `(2,)` of the tip nodes.
 
@@ -51,7 +51,7 @@ def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.mean(placed(scene, x)[_tip(scene)][:, :2], axis=0)
 
 
-@usual_rules
+@one_program
 def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     """Rotation of the tip section `()` in degrees, anticlockwise: the rigid turn that fits it best.
 
@@ -73,19 +73,19 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.rad2deg(jnp.arctan2(sine, jnp.sum(before * after)))
 
 
-@usual_rules
+@one_program
 def tendon_lengths(scene: Scene, x: jax.Array) -> jax.Array:
     """Present length of each tendon, `(m,)`."""
     return _measured(scene, x, "length")
 
 
-@usual_rules
+@one_program
 def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `dE/dl = k (l - l*)` of each tendon, `(m,)`; positive when it pulls its ends together."""
     return _measured(scene, x, "tension")
 
 
-@usual_rules
+@one_program
 def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(t, 2, 2)` in the plane, one for each element of the solid: `P F^T / J`.
 
@@ -95,7 +95,7 @@ def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     return _over_elements(scene, x, _stress)
 
 
-@usual_rules
+@one_program
 def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
 
@@ -118,7 +118,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     return total / jnp.where(area > 0, area, 1)[:, None, None]
 
 
-@usual_rules
+@one_program
 def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Elastic energy `(t,)` of each element of solids and rods, in the order of the terms; sum it for the body's."""
     x = placed(scene, x)
@@ -126,7 +126,7 @@ def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.concatenate([*found, jnp.zeros(0, x.dtype)])
 
 
-@usual_rules
+@one_program
 def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
     """`J = det F` `(t,)` of each element of the solid, averaged over its quadrature points."""
     return _over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.compiling import one_program, usual_rules
 from jaxbeam.core.tree import (
     Numbers,
     holds_arrays,
@@ -274,20 +274,20 @@ def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
     return Evaluation(energy, energy_scale, both[..., 0], both[..., 1])
 
 
-@usual_rules
+@one_program
 def energy(scene: Scene, x: jax.Array) -> jax.Array:
     """Total energy `()` at node positions `x` `(n, 2)`; differentiable in the scene and in `x`."""
     x = placed(scene, x)
     return sum((jnp.sum(jax.vmap(t.energy)(x[t.nodes], t.params)) for t in scene.terms), jnp.zeros((), x.dtype))
 
 
-@usual_rules
+@one_program
 def forces(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of all terms on each node: minus the gradient of the energy."""
     return -evaluate(scene, placed(scene, x)).gradient
 
 
-@usual_rules
+@one_program
 def reactions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of the clamp on each node, zero for coordinates that are free.
 
@@ -302,7 +302,7 @@ def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[j
     return [term.kind.hessians(x[term.nodes], term.params, convex) for term in scene.terms]
 
 
-@usual_rules
+@one_program
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
     """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods; infinite if there are
     neither. It is not only looked for at quadrature points."""

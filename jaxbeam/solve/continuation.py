@@ -293,7 +293,7 @@ def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume:
     converged = (attempt.residual <= problem.solver.tolerance(attempt.x.dtype)) & ~state.given_up
     finite = jnp.isfinite(attempt.evaluation.energy) & jnp.all(jnp.isfinite(attempt.evaluation.gradient))
     definite, marginal = attempt.stiffness.definite, attempt.stiffness.marginal
-    inaccurate = marginal | (definite & ((attempt.correction > INACCURATE) | attempt.singular))
+    inaccurate = marginal | attempt.singular | (definite & (attempt.correction > INACCURATE))
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,

@@ -139,7 +139,7 @@ class State(NamedTuple):
     step: `(n, d)` the step to take next.
     response: `(n, d)` displacement under the forces of the probe, at `x`.
     correction: `()` largest move of a node in `step`, over the size of the body.
-    singular: `()` whether the lowest eigenvalue of the stiffness is within its round-off. Known at the end only.
+    singular: `()` whether the lowest eigenvalue of the stiffness is within round-off of zero. Known at the end only.
     residual: `()` relative residual at `x`.
     counts: what was counted.
     initial: `()` whether `step` leads to the start of the method; such a step is not counted.
@@ -211,7 +211,7 @@ def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
     return State(
         x=x,
         evaluation=Evaluation(zero, zero, zeros, zeros),
-        stiffness=Stiffness(factor, yes, ~yes, zero, zero, zeros),
+        stiffness=Stiffness(factor, yes, ~yes, ~yes, zero, zero, zeros),
         step=displacement,
         response=zeros,
         correction=zero,

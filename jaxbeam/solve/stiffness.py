@@ -57,7 +57,8 @@ class Stiffness(NamedTuple):
 
     factor: positive definite Cholesky factor: of the true Hessian if `definite`, else of a modified one.
     definite: `()` whether the true Hessian is positive definite.
-    marginal: `()` whether round-off decided that, so that its sign is unknown.
+    marginal: `()` whether round-off of the factor decided that, so that its sign is unknown.
+    near_zero: `()` whether it is not, and its lowest eigenvalue is within `unknown_share` of zero.
     pivot: `()` the smallest pivot of the factor.
     largest: `()` the largest magnitude on the diagonal of the true Hessian.
     rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`; zero where they decide nothing.
@@ -66,6 +67,7 @@ class Stiffness(NamedTuple):
     factor: Any
     definite: jax.Array
     marginal: jax.Array
+    near_zero: jax.Array
     pivot: jax.Array
     largest: jax.Array
     rows: jax.Array
@@ -95,9 +97,9 @@ def factorise(
 ) -> Stiffness:
     """The stiffness at `x`, with a positive definite factor.
 
-    The matrices tried are, in this order: the true Hessian; the true Hessian shifted by no more than round-off, which
-    makes it `marginal`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing share;
-    the projected Hessian, shifted.
+    The matrices tried are, in this order: the true Hessian; the true Hessian shifted by round-off, or far from the
+    origin by `unknown_share`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing
+    share; the projected Hessian, shifted.
 
     Args:
         scene: to be solved.
@@ -131,11 +133,12 @@ def factorise(
     tries, factor, done, _ = lax.while_loop(going, attempt, begin)
     pivots = jnp.where(layout.slots < layout.position.size, linear.pivots(layout, factor), jnp.inf)
     small = jnp.min(pivots / diagonal) <= PIVOT_ROUND_OFF * round_off
-    marginal = done & ((tries == 2) | ((tries == 1) & small))
+    near_zero = done & (tries == 2)
+    marginal = (near_zero & (unknown <= round_off)) | (done & (tries == 1) & small)
     rows = compute_if(
         rows_may_decide(unbalanced, allowed, largest, x), partial(row_magnitudes, scene), jnp.zeros_like(x), hessians
     )
-    return Stiffness(factor, done & (tries == 1), marginal, jnp.min(pivots), largest, rows)
+    return Stiffness(factor, done & (tries == 1), marginal, near_zero, jnp.min(pivots), largest, rows)
 
 
 def unknown_share(x: jax.Array, size: jax.Array) -> jax.Array:
@@ -147,7 +150,7 @@ def unknown_share(x: jax.Array, size: jax.Array) -> jax.Array:
 def is_singular(
     scene: Scene, layout: Layout, x: jax.Array, size: jax.Array, stiffness: Stiffness, linear: LinearSolver
 ) -> jax.Array:
-    """Whether the sign of the lowest eigenvalue of a stiffness, positive definite as it was factored, is unknown, `()`.
+    """Whether the lowest eigenvalue of a stiffness is within `unknown_share` of zero, `()`.
 
     Args:
         scene: it belongs to.
@@ -168,7 +171,7 @@ def is_singular(
     share, largest = unknown_share(x, size), stiffness.largest
     soft = stiffness.definite & (stiffness.pivot <= SOFT_PIVOT * jnp.sqrt(share) * largest)
     lowest = compute_if(soft, softest, jnp.asarray(jnp.inf, x.dtype), stiffness.factor)
-    return lowest <= share * largest
+    return stiffness.near_zero | (lowest <= share * largest)
 
 
 def _modification(

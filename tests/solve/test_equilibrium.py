@@ -444,7 +444,7 @@ def test_a_state_on_the_way_keeps_its_stiffness_for_a_step_of_a_millionth():
         true, _ = solver.linear.factor(layout, assemble(layout, stencil_hessians(scene, state.x)))
         return jnp.max(jnp.abs(state.stiffness.factor - true)) / jnp.max(true), state.counts.steps
 
-    # One step each. The third spring, without tension, is strained by the share that the node moves, and stiffer across.
+    # One step each. The third spring, without tension, is strained by the share that the node moves: stiffer across.
     near, far = off(unlock(scene), 1e-7), off(unlock(scene), 1e-5)
     assert int(near[1]) == int(far[1]) == 1
     assert 1e-8 < near[0] < 1e-6

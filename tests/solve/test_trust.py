@@ -127,8 +127,8 @@ def test_rounding_far_away_pretends_tension():
     shift = np.asarray(scene.mesh.nodes[4]) - np.asarray(centred.mesh.nodes[4])
     off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max(axis=(1, 2)) / 3.5
     assert (off > 5e-3).any()
-    # Rounding may also make a stiffness indefinite that is not.
-    assert np.all((np.asarray(found.status) == jb.Status.INACCURATE) | (off < 2e-3))
+    # Rounding may also make a stiffness indefinite that is not, which is UNSTABLE beside.
+    assert np.all((np.asarray(found.status) & jb.Status.INACCURATE > 0) | (off < 2e-3))
 
 
 # ------------------------------------------------------------------------------------------ limits of stability
