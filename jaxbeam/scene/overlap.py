@@ -23,6 +23,7 @@ from jaxbeam.scene.scene import Scene
 SEGMENTS = 4
 
 
+@jax.jit
 def crossing(scene: Scene, x: jax.Array) -> jax.Array:
     """The first two edges of the surface that cross at `x` `(n, d)`, as node numbers `(2, 2)` of their ends; -1 if none
     do. Edges that share a node do not count: `J` says whether these fold over."""

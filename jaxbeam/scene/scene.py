@@ -262,6 +262,8 @@ class Evaluation(NamedTuple):
     gradient_scale: jax.Array
 
 
+# Jitted, so that programs of the same scene share its trace.
+@jax.jit
 def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
     """Energy and gradient at node positions `x` `(n, 2)`."""
     energy = energy_scale = jnp.zeros((), x.dtype)

@@ -7,6 +7,7 @@ by no more than its round-off.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -46,6 +47,7 @@ class SearchResult(NamedTuple):
     moved: jax.Array
 
 
+@partial(jax.jit, static_argnames="keep_volume")
 def line_search(
     scene: Scene,
     x: jax.Array,

@@ -85,6 +85,7 @@ def largest_diagonal(layout: Layout, storage: jax.Array) -> jax.Array:
     return jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
 
 
+@partial(jax.jit, static_argnames="linear")
 def factorise(
     scene: Scene,
     layout: Layout,

@@ -17,7 +17,7 @@ ALONG = 81
 @pytest.mark.parametrize(
     ("cells", "order", "rtol"),
     [
-        pytest.param(16, 2, 2e-3, id="P2"),
+        pytest.param(16, 2, 2e-3, id="P2", marks=pytest.mark.slow),
         pytest.param(64, 2, 2e-4, id="P2 fine", marks=pytest.mark.slow),
         pytest.param(64, 1, 7e-3, id="P1 fine", marks=pytest.mark.slow),
     ],

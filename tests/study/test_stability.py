@@ -82,6 +82,7 @@ def test_modes_of_the_reference_beam(beam):
         compare(scene, x, jb.lowest_mode(scene, x), 1e-11)
 
 
+@pytest.mark.slow
 def test_modes_in_float32(far):
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), far)
     for squeeze in (0.0, 0.3):
