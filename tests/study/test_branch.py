@@ -193,6 +193,7 @@ def test_folds_of_the_one_sided_beam(beam, folded):
     assert all(abs(turn - c.after) <= 1 for turn, c in zip(turns, folded.critical, strict=True))
 
 
+@pytest.mark.slow
 def test_folds_by_the_turning_point(beam, folded):
     """The extreme of a polynomial through the branch's points near each fold: no eigenvalue in it."""
     for fold, step in zip(folded.critical, (0.001, 0.002, 0.001), strict=True):
