@@ -47,8 +47,6 @@ PUBLISHED = -3.4
 # One setting throughout, so that everything is compiled once: saddles are wanted here.
 SOLVER = jb.Newton(escape=False)
 
-tip_angle = jax.jit(jb.tip_angle)
-
 
 def trace(scene: jb.Scene, **start: Any) -> jb.Branch:
     """A branch towards `END`, up to where it would go on with an element turned inside out."""
@@ -83,7 +81,7 @@ def trace_pair(scene: jb.Scene, fork: jb.Critical) -> list[jb.Branch]:
 
 def join(scene: jb.Scene, fork: jb.Critical, back: jb.Branch, onward: jb.Branch) -> jb.Branch:
     """One branch that begins at the bifurcation: `back` turned round, up to where it reaches it, and `onward`."""
-    angles = np.array([float(tip_angle(scene, jnp.asarray(x))) for x in back.x])
+    angles = np.array([float(jb.tip_angle(scene, jnp.asarray(x))) for x in back.x])
     count = int(np.argmax(angles * np.sign(angles[0]) < 0)) or len(angles)
     first = {"parameter": fork.parameter, "ratios": fork.ratios, "x": fork.x, "negative": 1, "residual": 0.0}
     first |= {"smallest_jacobian": float(jb.smallest_jacobian(scene, fork.x)), "overlapping": False}
@@ -101,7 +99,7 @@ def pull(scene: jb.Scene) -> tuple[np.ndarray, np.ndarray]:
     ratios, angles, x = np.linspace(1.0, GOAL[0], STEPS), [], scene.mesh.nodes
     for ratio in ratios:
         x = jb.check(jb.equilibrium(jb.command(scene, [ratio, ratio]), x, SOLVER)).x
-        angles.append(float(tip_angle(scene, x)))
+        angles.append(float(jb.tip_angle(scene, x)))
     return ratios, np.array(angles)
 
 
@@ -239,7 +237,7 @@ def main(out: Path) -> dict[str, float]:
         (mirrored, "bent pair", each) for each in pair
     )]:  # fmt: skip
         for number, point in enumerate(branch.critical, 1):
-            angle = float(tip_angle(scene, point.x))
+            angle = float(jb.tip_angle(scene, point.x))
             print(f"  {name:12} {point.kind:12} {point.ratios[0]:.8f}  {angle:+12.5f}")
             if name != "bent pair":
                 numbers[f"{name} {point.kind} {number}"] = float(point.ratios[0])
@@ -252,7 +250,7 @@ def main(out: Path) -> dict[str, float]:
         "  energy        tip angle, deg   smallest J   found   first from       status"
     )
     for state, ratios, count in found:
-        angle = float(tip_angle(lopsided, state.x))
+        angle = float(jb.tip_angle(lopsided, state.x))
         mark = "   <- pulled in steps" if abs(angle - pulled[1][-1]) < 1e-6 else ""
         print(
             f"  {float(state.energy):11.5f}  {angle:+13.5f}   {float(state.smallest_jacobian):10.4f}   {count:5}   "
@@ -268,7 +266,9 @@ def main(out: Path) -> dict[str, float]:
     print(f"bending eigenvalue: {bending[0]:.3f} at first, {bending[1]:.3f} at ratio {bending[2]:.3f}, its highest")
     print("drawing equilibria.png ...", flush=True)
     kinds = ["overlapping" if int(s.status) else f"energy {float(s.energy):.1f}" for s, _, _ in found]
-    titles = [f"{float(tip_angle(lopsided, s.x)):+.2f}°, {kind}" for (s, _, _), kind in zip(found, kinds, strict=True)]
+    titles = [
+        f"{float(jb.tip_angle(lopsided, s.x)):+.2f}°, {kind}" for (s, _, _), kind in zip(found, kinds, strict=True)
+    ]
     states = plot.States(lopsided, np.tile(GOAL, (len(found), 1)), np.stack([s.x for s, _, _ in found]))
     plot.gallery(states, titles).savefig(out / "equilibria.png", dpi=200)
     print(f"pictures are in {out}")

@@ -21,12 +21,6 @@ from tests.energies import Problem
 
 EPS = np.finfo(np.float64).eps
 
-# Jitted once for all tests: op by op, each new shape would compile every operation by itself.
-energy = jax.jit(jb.energy)
-forces = jax.jit(jb.forces)
-reactions = jax.jit(jb.reactions)
-cauchy_stress = jax.jit(jb.cauchy_stress)
-
 # ---------------------------------------------------------------------------------------------- meshes
 
 
@@ -211,7 +205,7 @@ def mean_piola(scene: jb.Scene, x: jax.Array) -> np.ndarray:
     The virial theorem (Bonet and Wood 2008, eq. 5.24, with div P = 0); exact where P is the same everywhere.
     """
     rest = np.asarray(scene.mesh.nodes)
-    return -np.asarray(forces(scene, x)).T @ rest / total_area(scene.mesh)
+    return -np.asarray(jb.forces(scene, x)).T @ rest / total_area(scene.mesh)
 
 
 def areas(mesh: jb.Mesh) -> np.ndarray:

@@ -12,7 +12,6 @@ from helpers import (
     assembled,
     central_difference,
     disturbed,
-    forces,
     l_shape,
     part,
     random_scene,
@@ -294,7 +293,7 @@ def test_stencil_hessians_sum_to_the_derivative_of_the_forces(name):
     x = mesh.nodes + 0.05 * np.random.default_rng(3).normal(size=shape)
     stencils = jax.jit(stencil_hessians)(scene, x)
     K = assembled(topology(scene), stencils)
-    differences = -central_difference(lambda y: forces(scene, jnp.asarray(y)), x, 1e-5).reshape(K.shape)
+    differences = -central_difference(lambda y: jb.forces(scene, jnp.asarray(y)), x, 1e-5).reshape(K.shape)
     # Central differences with h = 1e-5: truncation h^2 f''' (lengths near 0.5) and round-off eps / h.
     np.testing.assert_allclose(K, differences, atol=1e-7 * np.abs(K).max())
     for hessian in stencils:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import MATERIALS, central_difference, energy, forces, lateral_stretch, rotation
+from helpers import MATERIALS, central_difference, lateral_stretch, rotation
 from scipy.special import ellipe, ellipk
 
 import jaxbeam as jb
@@ -112,7 +112,7 @@ def test_linear_energy_is_simos():
     """`1/2 (EA eps^2 + GA gamma^2 + EI kappa^2) L` with the strains `R^T r' - e1` and `theta'` of the middle."""
     line, rng = straight(2.0, 0.3, 2), np.random.default_rng(0)
     x = np.asarray(line.nodes) + [[0, 0, 0.3 * 2.0]] + 0.1 * rng.normal(size=(2, 3))
-    found = energy(jb.Scene(line, (rod(line, 0.5, jb.Lame(MU, LAM), jb.linear_elastic),), jb.clamped(line, [0])), x)
+    found = jb.energy(jb.Scene(line, (rod(line, 0.5, jb.Lame(MU, LAM), jb.linear_elastic),), jb.clamped(line, [0])), x)
     slope = (x[1] - x[0]) / 2.0
     eps, gamma = rotation(x[:, 2].mean() / 0.3).T @ slope[:2] - [1, 0]
     plane = 4 * MU * (LAM + MU) / (LAM + 2 * MU)
@@ -123,12 +123,12 @@ def test_linear_energy_is_simos():
 def test_rigid_motions_of_a_curved_rod_cost_nothing():
     line = arc()
     scene = jb.Scene(line, (rod(line, HEIGHT, jb.lame(1e4, 0.45)),), jb.clamped(line, [0]))
-    assert energy(scene, line.nodes) == 0
+    assert jb.energy(scene, line.nodes) == 0
     for angle in (0.7, 8.0):
         moved = np.asarray(line.nodes) @ np.pad(rotation(angle).T, (0, 1)) + [1.0, -2.0, 0.0]
         moved[:, 2] = np.asarray(line.nodes)[:, 2] + HEIGHT * angle
         # Stiffness times round-off of positions.
-        np.testing.assert_allclose(forces(scene, jnp.asarray(moved)), 0, atol=1e4 * 1e-14)
+        np.testing.assert_allclose(jb.forces(scene, jnp.asarray(moved)), 0, atol=1e4 * 1e-14)
 
 
 def test_stretches_of_fibres():
@@ -201,8 +201,8 @@ def test_scene_at_rest(beam):
     np.testing.assert_allclose(threads.params.natural, 1.75, rtol=1e-15)
     np.testing.assert_array_equal(beam.fixed, np.arange(9)[:, None] == [0, 0, 0])
     np.testing.assert_array_equal(beam.tip, [8])
-    assert energy(beam, beam.mesh.nodes) == 0
-    assert np.abs(forces(beam, beam.mesh.nodes)).max() == 0
+    assert jb.energy(beam, beam.mesh.nodes) == 0
+    assert np.abs(jb.forces(beam, beam.mesh.nodes)).max() == 0
     assert jax.tree.structure(beam) == jax.tree.structure(jb.rod_beam(length=2.0))
 
 

@@ -4,19 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import (
-    EPS,
-    MATERIALS,
-    affine,
-    annulus,
-    central_difference,
-    disturbed,
-    energy,
-    forces,
-    l_shape,
-    macneal_harder,
-    shuffled,
-)
+from helpers import EPS, MATERIALS, affine, annulus, central_difference, disturbed, l_shape, macneal_harder, shuffled
 from jax.flatten_util import ravel_pytree
 
 import jaxbeam as jb
@@ -73,7 +61,7 @@ def test_force_patch(density):
     mesh = macneal_harder()
     F = np.array([[1.1, 0.2], [-0.1, 0.9]])
     scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e6, 0.25), density),), np.zeros((8, 2), bool))
-    nodal = np.asarray(forces(scene, affine(mesh, F)))
+    nodal = np.asarray(jb.forces(scene, affine(mesh, F)))
     params = jb.lame(1e6, 0.25)
     P = MATERIALS[density](F, float(params.mu), float(params.lam))
     expected = np.zeros((8, 2))
@@ -143,13 +131,13 @@ def test_tendon_law(law, ratio):
     k = LAWS[law](modulus, commanded)
     x = UNIT.nodes.at[4, 0].add(-0.3)
     length = natural - 0.3
-    np.testing.assert_allclose(energy(scene, x), 0.5 * k * (length - commanded) ** 2, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jb.energy(scene, x), 0.5 * k * (length - commanded) ** 2, rtol=1e-13, atol=1e-14)
     tension = float(jb.tendon_tensions(scene, x)[0])
     np.testing.assert_allclose(tension, k * (length - commanded), rtol=1e-13)
     assert (tension > 0) == (ratio < 0.85)
     expected = np.zeros((6, 2))
     expected[0, 0], expected[4, 0] = tension, -tension  # positive pulls the ends together
-    np.testing.assert_allclose(forces(scene, x), expected, atol=1e-13 * abs(tension))
+    np.testing.assert_allclose(jb.forces(scene, x), expected, atol=1e-13 * abs(tension))
 
 
 @each_law
@@ -173,7 +161,7 @@ def test_guides():
     np.testing.assert_allclose(scene.terms[0].params.natural, [natural], rtol=4 * EPS)
     scene = jb.command(scene, [0.5])
     tension = 5.0 * 0.5 * natural
-    nodal = np.asarray(forces(scene, UNIT.nodes))
+    nodal = np.asarray(jb.forces(scene, UNIT.nodes))
     unit = np.array([1.0, 1.0]) / np.sqrt(2)
     expected = np.zeros((6, 2))
     expected[0], expected[4] = tension * unit, tension * unit * [-1, 1]
@@ -248,16 +236,16 @@ def test_dead_load():
     expected = np.zeros((6, 2))
     expected[3], expected[4] = [1, 2], [-3, 0.5]
     x = affine(UNIT, np.diag([2.0, 3.0]))
-    np.testing.assert_array_equal(forces(scene, x), expected)
-    np.testing.assert_array_equal(forces(scene, UNIT.nodes), expected)
-    assert energy(scene, UNIT.nodes) == 0
-    np.testing.assert_allclose(energy(scene, x), -np.sum(expected * (x - UNIT.nodes)), rtol=4 * EPS)
+    np.testing.assert_array_equal(jb.forces(scene, x), expected)
+    np.testing.assert_array_equal(jb.forces(scene, UNIT.nodes), expected)
+    assert jb.energy(scene, UNIT.nodes) == 0
+    np.testing.assert_allclose(jb.energy(scene, x), -np.sum(expected * (x - UNIT.nodes)), rtol=4 * EPS)
 
 
 def test_dead_load_shared_and_repeated():
     """One force for all nodes; a node listed twice is loaded twice."""
     scene = jb.Scene(UNIT, (jb.dead_load(UNIT, [3, 4, 4], [0, -1]),), jb.clamped(UNIT, [0]))
-    np.testing.assert_array_equal(forces(scene, UNIT.nodes)[:, 1], [0, 0, 0, -1, -2, 0])
+    np.testing.assert_array_equal(jb.forces(scene, UNIT.nodes)[:, 1], [0, 0, 0, -1, -2, 0])
 
 
 @pytest.mark.parametrize("stiffness", [4.0, [4.0, 0.0], np.array([4, 2]), jnp.array([1.0, 2.0])])
@@ -267,8 +255,8 @@ def test_penalty_springs(stiffness):
     k = np.zeros(6)
     k[[1, 2]] = stiffness
     x = UNIT.nodes + moved
-    np.testing.assert_allclose(forces(scene, x), -k[:, None] * moved, rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(energy(scene, x), 0.5 * np.sum(k * np.sum(moved**2, axis=1)), rtol=1e-14)
+    np.testing.assert_allclose(jb.forces(scene, x), -k[:, None] * moved, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(jb.energy(scene, x), 0.5 * np.sum(k * np.sum(moved**2, axis=1)), rtol=1e-14)
 
 
 # ---------------------------------------------------------------------------------- what is refused

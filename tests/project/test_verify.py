@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import energy, scene_of
+from helpers import scene_of
 from scipy.linalg import eigh
 
 import jaxbeam as jb
@@ -66,7 +66,7 @@ def test_energy_and_forces_are_the_librarys(kind):
     scene = jb.command(scene_of(raw), ratios)
     x = raw.nodes + 0.03 * np.random.default_rng(1).normal(size=raw.nodes.shape) * ~raw.fixed
     true = facts(raw, ratios, x, dense=False)
-    np.testing.assert_allclose(true.energy, energy(scene, x), rtol=1e-12)
+    np.testing.assert_allclose(true.energy, jb.energy(scene, x), rtol=1e-12)
     gradient = np.asarray(jax.jit(jax.grad(jb.energy, argnums=1))(scene, jnp.asarray(x)))
     np.testing.assert_allclose(true.gradient, gradient[~raw.fixed], atol=1e-12 * true.scale_sum)
     if raw.is_rod:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import affine, cauchy_stress, energy, rotation, small_beam
+from helpers import affine, rotation, small_beam
 
 import jaxbeam as jb
 from jaxbeam.scene.scene import smallest_jacobian
@@ -28,6 +28,19 @@ def test_tip_angle(small, rise):
     x[small.tip, 0] -= 0.7
     expected = np.degrees(np.arctan2(rise, 3.5))
     np.testing.assert_allclose(jb.tip_angle(small, jnp.asarray(x)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["tip_angle", "tendon_tensions", "cauchy_stress", "nodal_stress", "reactions"])
+def test_a_measure_is_one_program(name, caplog):
+    """Of a shape that no other test has. Operation by operation there would be ten and more of them."""
+    scene = jb.tendon_beam(9, 2)
+    x = jnp.asarray(scene.mesh.nodes)
+    jb.tip_position(scene, x)
+    with jax.log_compiles():
+        getattr(jb, name)(scene, x)
+    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
+    assert len(compiled) == 1
+    assert name in compiled[0]
 
 
 @pytest.mark.parametrize("angle", [0.5, np.pi / 2, -2.5])
@@ -82,7 +95,7 @@ def test_tension_is_the_derivative_of_the_energy(steered):
     assert abs(other) > 1
     h = 1e-6
     end = int(line[1])
-    shifted = [energy(thread, solution.x.at[end].add(s * h * unit)) for s in (1, -1)]
+    shifted = [jb.energy(thread, solution.x.at[end].add(s * h * unit)) for s in (1, -1)]
     tension = (shifted[0] - shifted[1]) / (2 * h)
     np.testing.assert_allclose(jb.tendon_tensions(scene, solution.x)[0], tension, rtol=1e-7)
 
@@ -96,11 +109,11 @@ def test_reference_tension(steered):
 def test_stress_is_symmetric_and_turns(small):
     x = affine(small.mesh, [[1.1, 0.2], [-0.1, 0.9]])
     R = rotation(0.7)
-    stress = np.asarray(cauchy_stress(small, x))
+    stress = np.asarray(jb.cauchy_stress(small, x))
     assert stress.shape == (16, 2, 2)
     size = np.abs(stress).max()
     np.testing.assert_allclose(stress, np.swapaxes(stress, 1, 2), atol=1e-13 * size)
-    turned = np.asarray(cauchy_stress(small, jnp.asarray(np.asarray(x) @ R.T)))
+    turned = np.asarray(jb.cauchy_stress(small, jnp.asarray(np.asarray(x) @ R.T)))
     np.testing.assert_allclose(turned, R @ stress @ R.T, atol=1e-12 * size)
 
 
@@ -129,8 +142,8 @@ def test_several_solids_are_joined():
     """Measures per element run through all solid terms, in order."""
     scene = jb.Scene(UNIT, (BODY, jb.solid(UNIT, jb.lame(5.0, 0.3))), LEFT)
     x = affine(UNIT, np.diag([1.1, 1.0]))
-    one = cauchy_stress(BARE, x)
-    np.testing.assert_allclose(cauchy_stress(scene, x), np.concatenate([one, 0.5 * one]), rtol=1e-13)
+    one = jb.cauchy_stress(BARE, x)
+    np.testing.assert_allclose(jb.cauchy_stress(scene, x), np.concatenate([one, 0.5 * one]), rtol=1e-13)
 
 
 def test_nothing_to_measure():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAIR_NODES, affine, forces, macneal_harder, reactions, small_beam, spring_pair, traces
+from helpers import PAIR_NODES, affine, macneal_harder, small_beam, spring_pair, traces
 
 import jaxbeam as jb
 from jaxbeam.core.tree import unlock
@@ -40,7 +40,7 @@ def check_reference(scene, solution, angle, lengths):
 def check_balance(scene, x, load=(0.0, 0.0, 0.0), share=BALANCE):
     """Free coordinates are in balance; reactions balance a load (force and moment) from outside."""
     fixed, x = scene.fixed, np.asarray(x)
-    nodal, held = np.asarray(forces(scene, x)), np.asarray(reactions(scene, x))
+    nodal, held = np.asarray(jb.forces(scene, x)), np.asarray(jb.reactions(scene, x))
     largest = np.abs(held).max()
     assert np.abs(nodal[~fixed]).max() < share * largest
     np.testing.assert_array_equal(held[fixed], -nodal[fixed])
@@ -196,7 +196,7 @@ def test_penalty_clamp(beam, steered):
     assert 0 < abs(shift) < 1e-5
     # The springs carry what the clamp carries, to the share that a shift of 1e-6 makes.
     carried = -1e9 * (soft.x - exact.mesh.nodes)[left]
-    held = reactions(exact, solution.x)[left]
+    held = jb.reactions(exact, solution.x)[left]
     np.testing.assert_allclose(carried, held, atol=1e-4 * np.abs(held).max())
 
 
