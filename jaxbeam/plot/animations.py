@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -117,6 +118,8 @@ def _play(
     draw(0)
     _fit(figure, axes[:1])
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    # None, not "none": for a placeholder each frame would be drawn twice. It stands for what the settings say.
+    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
     last = len(states[0]) - 1
     return FuncAnimation(figure, draw, frames=[*range(last), *[last] * HOLD], interval=80, cache_frame_data=False)

@@ -252,6 +252,7 @@ def test_six_nodes_do_not_lock():
     assert np.ptp(np.percentile(pressures[0][0], [2, 98])) > 5 * (high - low)
 
 
+@pytest.mark.slow
 def test_linear_response_is_the_slope_at_rest():
     scene = jb.tendon_beam(5, 3, order=2, anchor_width=0.3)
     bent = lambda ratio: jb.tip_angle(scene, jb.linear_response(jb.command(scene, jnp.array([ratio, 1.0]))))

@@ -153,6 +153,7 @@ def test_through_each():
         np.testing.assert_allclose(value, expected, rtol=1e-8, err_msg=name)
 
 
+@pytest.mark.slow
 def test_no_derivative():
     """NaN where the search fails (a number that is refused unless it is traced), and at rest, where either command may
     be the one to move."""

@@ -240,6 +240,7 @@ def test_no_slope_is_no_information(small):
         assert int(jb.reach(small, target, over_two_degrees, starts=[[0.7, 1.0]]).status) == status
 
 
+@pytest.mark.slow
 def test_each_of_several_targets_with_slack_tendons():
     """One that is no number (refused unless it is traced) ends, and harms no other. The last asks for the tendon that
     is slack where the first ended, where only the other one has an effect."""
