@@ -17,8 +17,8 @@ from jaxbeam.scene.scene import Evaluation, Scene
 # Round-off of the force at a coordinate, over `eps max|x|` times the sum of the magnitudes in its row of the stiffness.
 # Measured: below 0.53 for triangles of three and six nodes, all materials and stiffnesses, and slender beams.
 FORCE_ROUND_OFF = 0.75
-# No sum of the magnitudes in a row is more than this many times the largest diagonal entry. Measured: 2 to 4 times on
-# meshes of all kinds, up to 10 beside wide anchors.
+# Taken to be more than any sum of the magnitudes in a row, over the largest diagonal entry. Measured: 2 to 4 on meshes
+# of all kinds, up to 10 beside wide anchors.
 LONGEST_ROW = 100.0
 
 

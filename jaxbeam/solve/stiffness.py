@@ -27,13 +27,14 @@ PIVOT_ROUND_OFF = 2.0
 SINGULAR = 2.0
 # Rounding far from the origin strains stiff elements, and the tension of these stiffens or softens the body across
 # them. The sign of an eigenvalue is unknown too below this many times `eps max|x| / size` times the largest diagonal
-# entry. Measured on rods and beams in float32, up to 3,000 lengths from the origin: every state that was more than 2e-3
-# of the body from its equilibrium was below 0.2, and every one above 0.6 within 1.1e-3.
+# entry. Measured on rods and beams in float32, up to 3,000 lengths from the origin, by the longest row, which in rods
+# is 3 times that entry: every state that was more than 2e-3 of the body from its equilibrium was below 0.1 times the
+# row, and every one above 0.3 times it within 1.1e-3.
 FAR = 0.4
-# A matrix whose lowest eigenvalue is the share `t` of its largest diagonal entry has a pivot of less than 1,400 sqrt(t)
-# times that entry: measured with `t` from 1e-15 to 1e-3 on beams and rods held in five ways, also with elements a
-# million times softer than others. So the eigenvalue is looked for only where a pivot is less than this many times
-# sqrt(t).
+# A matrix whose lowest eigenvalue is the share `t` of its largest diagonal entry has a pivot of less than 1,800 sqrt(t)
+# times that entry. Measured by the longest row, of 2 to 3 times the entry, with `t` from 1e-15 to 1e-3 on beams and
+# rods held in five ways, also with elements a million times softer than others. So the eigenvalue is looked for only
+# where a pivot is less than this many times sqrt(t).
 SOFT_PIVOT = 1e4
 
 
@@ -58,7 +59,7 @@ class Stiffness(NamedTuple):
     factor: positive definite Cholesky factor: of the true Hessian if `definite`, else of a modified one.
     definite: `()` whether the true Hessian is positive definite.
     marginal: `()` whether round-off of the factor decided that, so that its sign is unknown.
-    near_zero: `()` whether it is not, and its lowest eigenvalue is within `unknown_share` of zero.
+    near_zero: `()` whether it is not, and becomes so when shifted by round-off, or by `far_share`.
     pivot: `()` the smallest pivot of the factor.
     largest: `()` the largest magnitude on the diagonal of the true Hessian.
     rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`; zero where they decide nothing.
@@ -99,7 +100,7 @@ def factorise(
     """The stiffness at `x`, with a positive definite factor.
 
     The matrices tried are, in this order: the true Hessian; the true Hessian shifted by round-off, or far from the
-    origin by `unknown_share`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing
+    origin by `far_share`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing
     share; the projected Hessian, shifted.
 
     Args:
@@ -116,7 +117,7 @@ def factorise(
     storage = assemble(layout, hessians)
     diagonal, largest = storage[layout.diagonal], largest_diagonal(layout, storage)
     round_off = float(jnp.finfo(storage.dtype).eps) * layout.slots.size**0.5
-    unknown = jnp.maximum(round_off, unknown_share(x, size))
+    unknown = jnp.maximum(round_off, far_share(x, size))
     finite = jnp.isfinite(unbalanced) & jnp.isfinite(largest)
     projected_at = lambda x: assemble(layout, stencil_hessians(scene, x, convex=True))
     first_blend = jnp.where(leaving_saddle, 2 + GENTLE_SHIFTS, 2)
@@ -142,16 +143,20 @@ def factorise(
     return Stiffness(factor, done & (tries == 1), marginal, near_zero, jnp.min(pivots), largest, rows)
 
 
-def unknown_share(x: jax.Array, size: jax.Array) -> jax.Array:
-    """The share `()` of the largest diagonal entry below which an eigenvalue's sign is unknown, at `x` `(n, d)`."""
-    far = FAR * jnp.max(jnp.abs(x)) / size
-    return float(jnp.finfo(x.dtype).eps) * jnp.maximum(SINGULAR, far)
+def far_share(x: jax.Array, size: jax.Array) -> jax.Array:
+    """The share `()` of the largest diagonal entry below which distance from the origin hides an eigenvalue's sign.
+
+    Args:
+        x: `(n, d)` positions.
+        size: `()` of the body.
+    """
+    return FAR * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x)) / size
 
 
 def is_singular(
     scene: Scene, layout: Layout, x: jax.Array, size: jax.Array, stiffness: Stiffness, linear: LinearSolver
 ) -> jax.Array:
-    """Whether the lowest eigenvalue of a stiffness is within `unknown_share` of zero, `()`.
+    """Whether the sign of the lowest eigenvalue of a stiffness is unknown, `()`: by round-off or by `far_share`.
 
     Args:
         scene: it belongs to.
@@ -169,7 +174,8 @@ def is_singular(
         move = linear.solve(layout, factor, load)
         return jnp.sum(load * move) / jnp.sum(move**2)
 
-    share, largest = unknown_share(x, size), stiffness.largest
+    share = jnp.maximum(SINGULAR * float(jnp.finfo(x.dtype).eps), far_share(x, size))
+    largest = stiffness.largest
     soft = stiffness.definite & (stiffness.pivot <= SOFT_PIVOT * jnp.sqrt(share) * largest)
     lowest = compute_if(soft, softest, jnp.asarray(jnp.inf, x.dtype), stiffness.factor)
     return stiffness.near_zero | (lowest <= share * largest)

@@ -128,7 +128,9 @@ def test_rounding_far_away_pretends_tension():
     off = np.abs(np.asarray(found.x, float) - shift - np.asarray(truth.x)).max(axis=(1, 2)) / 3.5
     assert (off > 5e-3).any()
     # Rounding may also make a stiffness indefinite that is not, which is UNSTABLE beside.
-    assert np.all((np.asarray(found.status) & jb.Status.INACCURATE > 0) | (off < 2e-3))
+    inaccurate = np.asarray(found.status) & jb.Status.INACCURATE > 0
+    assert np.all(inaccurate | (off < 2e-3))
+    assert np.mean(inaccurate) > 0.9
 
 
 # ------------------------------------------------------------------------------------------ limits of stability
