@@ -125,6 +125,7 @@ KNOBS: dict[str, Callable[[str], dict[str, tuple]]] = {
     "units": lambda dtype: {"length": UNITS[dtype], "stress": UNITS[dtype]},
     "both ends": lambda dtype: {**BODY, "load": LOADS},
     "roller": lambda dtype: {**BODY, "load": LOADS},
+    "two bodies": lambda dtype: {**BODY, "others": RATIOS},
     "rod": lambda dtype: {
         "poisson": POISSON,
         "factor": FACTORS,
@@ -178,6 +179,8 @@ def groups() -> list[Group]:
         ("units", 5, 3, "crossed", (nh,), one, 16, {**six, "width": 0.4}),
         ("both ends", 9, 5, "one-sided", (mm, nh), two, 16, {}),
         ("roller", 9, 5, "crossed", (mm,), one, 16, {}),
+        ("two bodies", 5, 3, "mirrored", (mm, nh), two, 24, {}),
+        ("two bodies", 9, 5, "one-sided", (mm,), one, 16, {}),
         ("rod", 9, 2, "", (mm, nh, linear), one, 24, {}),
         ("rod", 9, 2, "", (mm,), ("float32",), 24, {}),
     ]
@@ -236,6 +239,8 @@ def build(group: Group, case: Case, dtype: str) -> tuple[jb.Scene, Problem]:
 def _solid(group: Group, case: Case, dtype: str) -> Problem:
     height, ny = case.height(group), group.ny
     mesh = jb.rectangle(LENGTH, height, group.nx, ny, group.diagonals, dtype, order=group.order, graded=group.graded)
+    if group.kind == "two bodies":
+        mesh = _twice(mesh, height)
     plain = np.asarray(mesh.nodes, np.float64)
     low, high = plain[:, 0] < -0.4999 * LENGTH, plain[:, 0] > 0.4999 * LENGTH
     fixed = np.repeat(low[:, None], 2, axis=1)
@@ -263,6 +268,13 @@ def _solid(group: Group, case: Case, dtype: str) -> Problem:
         _tendons(group, case),
         load=load,
     )
+
+
+def _twice(mesh: jb.Mesh, height: float) -> jb.Mesh:
+    """The body, and another above it that nothing joins to it. Its nodes follow those of the first."""
+    nodes, elements = np.asarray(mesh.nodes), np.asarray(mesh.elements)
+    above = nodes + np.array([0.0, 2 * height + LENGTH], nodes.dtype)
+    return jb.Mesh(np.concatenate([nodes, above]), np.concatenate([elements, elements + len(nodes)]))
 
 
 def _contrast(case: Case, centres: np.ndarray, group: Group) -> Any:
@@ -294,6 +306,9 @@ def _tendons(group: Group, case: Case) -> tuple[Tendons, ...]:
     lines = np.array([[ny - 1, middle + ny - 1], [0, middle]])
     widths = case.length * np.array([[0.0, group.width]] * 2)
     pair = Tendons(lines, modulus(group.law, case.factor), group.law, widths)
+    if group.kind == "two bodies":
+        both = np.concatenate([lines, lines + group.nx * ny])
+        return (Tendons(both, modulus(group.law, case.factor), group.law, np.concatenate([widths, widths])),)
     at = lambda *places: [column * ny + row for column, row in places]
     if group.kind == "moduli":
         more = np.array([at((0, 0), (0, ny - 1)), at((0, 2), (6, 2)), at((5, 1), (7, 3))])

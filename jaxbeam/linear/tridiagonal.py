@@ -1,13 +1,14 @@
 """Block-tridiagonal Cholesky with a border, over the levels of the mesh.
 
-Nodes are put in a chain of blocks, of which only neighbours are coupled (`jaxbeam.linear.blocks`), and those that
-couple far blocks in a border that is eliminated last:
+Nodes form a chain of blocks in which each is coupled to its neighbours only (`jaxbeam.linear.blocks`). Nodes that
+couple distant blocks form a border, which is eliminated last:
 
     K = [ T   E ]     T block tridiagonal, S the border's own block.
         [ E^T S ]
 
-This is the exact counterpart of a low-rank (Woodbury) correction. It needs no `T` that is definite by itself and has
-no cancellation when a tendon is stiff: the Cholesky factor exists if and only if `K` is positive definite.
+A low-rank (Woodbury) correction would solve the same equations. It would need a stiffness that is definite without the
+tendons, and it would lose digits by cancellation when a tendon is stiff. The Cholesky factor here exists if and only if
+`K` is positive definite.
 """
 
 from __future__ import annotations
@@ -26,15 +27,19 @@ from jaxbeam.core import checks
 from jaxbeam.linear.blocks import Topology, chain_of, coupled
 from jaxbeam.linear.layout import Layout, _inverse, _layout, _mirrored
 
-# --------------------------------------------------------------------------------- block tridiagonal
-
 
 class BorderedFactor(NamedTuple):
-    """`K = L L^T` by blocks: `pivot (b, w, w)` the transposes of its diagonal blocks, in which order LAPACK reads them,
-    `beside (b, tall, head + r)` the transposes of what is below them and `corner (r, r)` the border's own pivot.
+    """Blocks of the Cholesky factor `L` in `K = L L^T`.
 
-    Only the last `tail` unknowns of a block are coupled to the next, and only to its first `head`: the first columns of
-    `beside`. The others are the border's. Where there is one all rows of a block are kept, else the last `tail`."""
+    pivot: `(b, w, w)`, diagonal blocks of `L`, transposed, because LAPACK reads them in this order.
+    beside: `(b, tall, head + r)`, blocks of `L` below the diagonal, transposed. The first `head` columns belong to the
+        next block, the others to the border. The rows are all `w` of the block if there is a border. Otherwise they are
+        the last `tail`, the only ones that are coupled to the next block.
+    corner: `(r, r)`, diagonal block of `L` for the border, not transposed.
+
+    `factor_indefinite` returns `K = L D L^T` in the same fields: `pivot` and `corner` are the inverses of the blocks of
+    `D`, and `beside` holds the blocks of `L D` below the diagonal, transposed.
+    """
 
     pivot: jax.Array
     beside: jax.Array
@@ -45,12 +50,12 @@ class BorderedFactor(NamedTuple):
 class BlockTridiagonal:
     """Bordered block-tridiagonal Cholesky over the levels of the mesh.
 
-    Each of `b` blocks has `w` unknowns, of which the first `head` are coupled to the last `tail` of the block before;
-    a factor holds `b (w^2 + tail head)` numbers, or with a border of `r` columns `b (w^2 + w (head + r))`. For its time
-    see `multiplications`.
+    Each of `b` blocks has `w` unknowns. The first `head` of them are coupled to the last `tail` of the block before. A
+    factor holds `b (w^2 + tail head)` numbers, or `b (w^2 + w (head + r)) + r^2` with a border of `r` columns. For its
+    time see `multiplications`.
 
-    joined: several levels of the mesh may make a block of up to this many unknowns. Fewer and wider blocks take more
-        arithmetic and less time, while they are small.
+    joined: several levels of the mesh may make a block of up to this many unknowns. As long as blocks are small, fewer
+        and wider ones take more arithmetic but less time.
     """
 
     joined: int = 32
@@ -66,15 +71,15 @@ class BlockTridiagonal:
 
         def eliminate(diagonal: jax.Array, beside: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             pivot = jnp.linalg.cholesky(diagonal, symmetrize_input=False).T
-            # All that is left of the block's rows at once: a call costs more than its arithmetic.
+            # One call for the next block and the border: a call costs more than its arithmetic.
             beside = lax.linalg.triangular_solve(pivot[skip:, skip:].T, beside, left_side=True, lower=True)
             return pivot, beside, beside.T @ beside
 
-        (pivot, beside), corner = _eliminated(layout, storage, eliminate)
+        (pivot, beside), corner = _eliminate_blocks(layout, storage, eliminate)
         r = len(corner)
         corner = jnp.linalg.cholesky(corner, symmetrize_input=False) if r else corner
-        # A failed block is NaN, and so is everything after it.
-        ok = jnp.isfinite(corner[-1, -1]) if r else jnp.isfinite(pivot[-1, -1, -1])
+        # A block that fails is NaN. The NaN spreads to the border, but not to blocks that are coupled to no other.
+        ok = jnp.isfinite(corner[-1, -1]) if r else jnp.all(jnp.isfinite(pivot[:, -1, -1]))
         return BorderedFactor(pivot, beside, corner), ok
 
     def pivots(self, layout: Layout, factor: BorderedFactor) -> jax.Array:
@@ -113,9 +118,9 @@ class BlockTridiagonal:
         return jnp.concatenate([inner.swapaxes(1, 2).reshape(b * w, k), outer.T]).reshape(rhs.shape)
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[BorderedFactor, jax.Array]:
-        """Block `L D L^T` with the pivots `D` inverted through their eigenvalues.
+        """Block `L D L^T`. The blocks of `D` are inverted through their eigenvalues.
 
-        The inertia of the matrix is the sum of its pivots' (Haynsworth 1968).
+        The inertia of the matrix is the sum of the inertias of these blocks (Haynsworth 1968).
         """
         skip = layout.blocks[1] - coupled(layout.blocks)[0]
 
@@ -123,7 +128,7 @@ class BlockTridiagonal:
             inverse, negative = _inverse(_mirrored(diagonal))
             return (inverse, negative), beside, beside.T @ inverse[skip:, skip:] @ beside
 
-        ((inverse, negative), beside), corner = _eliminated(layout, storage, eliminate)
+        ((inverse, negative), beside), corner = _eliminate_blocks(layout, storage, eliminate)
         corner, last = _inverse(_mirrored(corner))
         return BorderedFactor(inverse, beside, corner), jnp.sum(negative, dtype=jnp.int32) + last
 
@@ -152,18 +157,27 @@ class BlockTridiagonal:
         return jnp.concatenate([inner.reshape(b * w), outer])
 
 
-def _eliminated(
+def _eliminate_blocks(
     layout: Layout,
     storage: jax.Array,
     eliminate: Callable[[jax.Array, jax.Array], tuple[Any, jax.Array, jax.Array]],
 ) -> tuple[tuple[Any, jax.Array], jax.Array]:
-    """Block after block eliminated: what `eliminate(diagonal, beside)` returns of each, `(pivot, beside)`, with leading
-    axis `b`, and what is left of the border's block. Third, it returns what is to be subtracted from all after it."""
+    """Eliminate one block after another.
+
+    Args:
+        layout: of the matrix.
+        storage: `(size,)`, the assembled matrix.
+        eliminate: from `diagonal` `(w, w)` and `beside` `(tall, wide)` of a block to its `pivot`, its `beside` and a
+            product `(wide, wide)`, which is subtracted from the next block and the border.
+
+    Returns:
+        `(pivot, beside)` of all blocks, with leading axis `b`, and the Schur complement `(r, r)` of the border.
+    """
     b, w, head, _, r = layout.blocks
     tall, wide = coupled(layout.blocks)
     diagonal, beside, corner = jnp.split(storage, np.cumsum([b * w * w, b * tall * wide]))
 
-    def one(carry: Any, block: Any) -> Any:
+    def step(carry: Any, block: Any) -> Any:
         passed, corner = carry
         diagonal, beside = block
         diagonal = diagonal - jnp.pad(passed[:, :head], ((0, w - head), (0, w - head)))
@@ -173,16 +187,16 @@ def _eliminated(
         return (product[:head], corner - product[head:, head:]), (pivot, beside)
 
     start = jnp.zeros((head, wide), storage.dtype), corner.reshape(r, r)
-    (_, corner), found = lax.scan(one, start, (diagonal.reshape(b, w, w), beside.reshape(b, tall, wide)))
+    (_, corner), found = lax.scan(step, start, (diagonal.reshape(b, w, w), beside.reshape(b, tall, wide)))
     return found, corner
 
 
-# Up to this width a loop is faster than a call of a matrix product.
+# Up to this many rows of the matrix, a loop is faster than a call of a matrix product.
 LOOPED = 64
 
 
 def _times(rows: jax.Array, matrix: jax.Array) -> jax.Array:
-    """The product of a few rows `(k, w)` with a square matrix."""
+    """The product of a few rows `(k, p)` with a matrix `(p, q)`."""
     if len(matrix) > LOOPED:
         return rows @ matrix
     return jnp.sum(rows[:, :, None] * matrix, axis=1)

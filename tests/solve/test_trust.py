@@ -210,3 +210,40 @@ def test_a_singular_matrix_has_a_small_pivot(held, solver, share):
     assert definite
     pivot = float(jnp.min(solver.pivots(layout, factor)[unknown]))
     assert share * largest * 0.99 <= pivot < 0.1 * SOFT_PIVOT * share**0.5 * largest
+
+
+# ------------------------------------------------------------------------------------------------- several bodies
+
+
+def pushed_apart(x, strength):
+    """The energy of a node that is pushed away from its place at rest."""
+    position, rest = x[0], strength[1:]
+    return -0.5 * strength[0] * jnp.sum((position - rest) ** 2)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_each_of_two_bodies_must_be_stable(which):
+    """Two bodies that nothing joins, each a block of its own in the stiffness: one is unstable at rest."""
+    one = jb.rectangle(1.0, 0.5, 6, 2)
+    nodes, elements = np.asarray(one.nodes), np.asarray(one.elements)
+    mesh = jb.Mesh(
+        np.concatenate([nodes, nodes + np.array([0.0, 3.0])]), np.concatenate([elements, elements + len(nodes)])
+    )
+    clamp = jb.clamped(mesh, jb.nodes_where(mesh, lambda x, y: x < -0.49))
+    tips = np.array([[11], [23]])
+    body = jb.solid(mesh, jb.lame(1e4, 0.3))
+    status = []
+    for strength in (0.0, 1e6):
+        strengths = np.zeros(2)
+        strengths[which] = strength
+        params = np.column_stack([strengths, np.asarray(mesh.nodes)[tips[:, 0]]])
+        scene = jb.Scene(mesh, (body, jb.Term(pushed_apart, tips, params)), clamp)
+        assert solver_blocks(scene) == (2, 0)
+        status.append(int(jb.equilibrium(scene, solver=jb.Newton(escape=False)).status))
+    assert status == [0, jb.Status.UNSTABLE]
+
+
+def solver_blocks(scene):
+    """How many blocks the stiffness has, and how many unknowns of a block are coupled to the next."""
+    blocks = jb.Newton().linear.layout(topology(scene)).blocks
+    return blocks[0], blocks[2]
