@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 
 import jaxbeam as jb
 from benchmarks.report import options, table, version
-from jaxbeam.mesh.elements import element_of, rule
+from jaxbeam.mesh.elements import element_of
 
 # --------------------------------------------------------------------------------- what several items need
 
@@ -515,7 +515,8 @@ def manufactured_errors(cells: int, order: int, solver: jb.Newton = jb.Newton())
     nodes, elements = np.asarray(mesh.nodes), mesh.elements
     fine = jb.solid(mesh, MMS_MATERIAL, degree=FINE).params
     weights, gradients = np.asarray(fine.weights), np.asarray(fine.gradients)
-    values = element_of(elements).shape(rule(FINE)[0])
+    element = element_of(elements)
+    values = element.shape(element.rule(FINE)[0])
     at_points = lambda field: np.einsum("qk,tkd->tqd", values, field[elements])
     u, slope, force = (np.asarray(field) for field in exact_fields(jnp.asarray(at_points(nodes))))
     loads = np.zeros_like(nodes)

@@ -1,38 +1,41 @@
-"""Checks of a mesh of triangles: what joins what, areas, curved edges, overlaps. All on the host."""
+"""Checks of a mesh: what joins what, areas, curved edges, overlaps. All on the host."""
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 
-from jaxbeam.mesh.bernstein import minimiser, value
-from jaxbeam.mesh.elements import EDGES, corner_slopes, determinants, element_of
+from jaxbeam.mesh.element import Determinant
+from jaxbeam.mesh.elements import element_of
 
-# A triangle of no more area than this share of the square of the body's extent has none.
+# An element of no more area than this share of the square of the body's extent has none.
 SLIVER = 1e-14
 
 
 def _check_topology(count: int, elements: np.ndarray) -> None:
+    kind = element_of(elements).name
     outside = np.flatnonzero(((elements < 0) | (elements >= count)).any(axis=1))
     if outside.size:
         k = outside[0]
-        raise ValueError(f"elements: triangle {k} is {elements[k].tolist()}, but nodes are numbered 0 to {count - 1}")
+        raise ValueError(f"elements: {kind} {k} is {elements[k].tolist()}, but nodes are numbered 0 to {count - 1}")
     ordered = np.sort(elements, axis=1)
     repeated = np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))
     if repeated.size:
         k = repeated[0]
-        raise ValueError(f"elements: triangle {k} repeats a node: {elements[k].tolist()}; remove it")
+        raise ValueError(f"elements: {kind} {k} repeats a node: {elements[k].tolist()}; remove it")
     used = np.zeros(count, bool)
     used[elements] = True
     if not used.all():
         unused = np.flatnonzero(~used)
         raise ValueError(
-            f"nodes: {unused.size} belong to no triangle, the first is node {unused[0]}; remove them and renumber"
+            f"nodes: {unused.size} belong to no {kind}, the first is node {unused[0]}; remove them and renumber"
         )
 
 
 def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
+    kind = element_of(elements).name
     if not np.isfinite(nodes).all():
         k = np.flatnonzero(~np.isfinite(nodes).all(axis=1))[0]
         raise ValueError(f"nodes: node {k} is not finite: {nodes[k].tolist()}")
@@ -53,34 +56,37 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         k = bad[0]
         cure = "list its corners counter-clockwise" if area[k] < 0 else "remove it, or move its nodes off one line"
         raise ValueError(
-            f"elements: triangle {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
-            f" ({bad.size} such triangles)"
+            f"elements: {kind} {k}, {elements[k].tolist()}, has area {area[k]:g}, expected positive; {cure}"
+            f" ({bad.size} such)"
         )
-    if not element_of(elements).affine:
-        _check_curves(nodes, elements, area)
+    determinant = element_of(elements).determinant
+    if determinant is not None:
+        _check_curves(determinant, nodes, elements, area)
 
 
 def _areas(nodes: Any, elements: np.ndarray) -> Any:
-    """Signed area `(t,)` of each triangle between its corners."""
-    a, b, c = (nodes[elements[:, k]] for k in range(3))
-    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    """Signed area `(t,)` of each element between its corners."""
+    first, *others = (nodes[elements[:, k]] for k in range(element_of(elements).corners))
+    spans = [corner - first for corner in others]
+    return 0.5 * sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] for a, b in itertools.pairwise(spans))
 
 
-def _check_curves(nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
-    """Refuse triangles of six nodes that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
-    slopes = corner_slopes(np.moveaxis(nodes[elements], 0, -1))
-    stretch = np.stack(determinants(slopes, slopes)) / (2 * area)
-    place = minimiser(stretch)
-    least = value(stretch, place)
+def _check_curves(determinant: Determinant, nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
+    """Refuse elements that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
+    kind = element_of(elements).name
+    slopes = determinant.slopes(np.moveaxis(nodes[elements], 0, -1))
+    stretch = determinant.coefficients(slopes, slopes) * element_of(elements).area / area
+    place = determinant.minimiser(stretch)
+    least = determinant.value(stretch, place)
     bad = np.flatnonzero(least <= 1e-12)
     if bad.size:
         k = bad[0]
         where = ", ".join(f"{coordinate:.3g}" for coordinate in place[:, k])
         raise ValueError(
-            f"elements: triangle {k}, {elements[k].tolist()}, folds over: its edges are curved so much that the "
-            f"determinant of its map is {least[k]:.3g} times that of the straight triangle at barycentric coordinates "
-            f"({where}), expected positive; move its nodes 3 to 5 towards the middles of its edges ({bad.size} such "
-            f"triangles)"
+            f"elements: {kind} {k}, {elements[k].tolist()}, folds over: its edges are curved so much that the "
+            f"determinant of its map is {least[k]:.3g} times that of straight edges at the mean of its corners "
+            f"weighted by ({where}), expected positive; move the nodes between its corners towards the middles of its "
+            f"edges ({bad.size} such)"
         )
 
 
@@ -91,10 +97,12 @@ def _surface_of(elements: np.ndarray) -> np.ndarray:
     """Edges `(b, 2)` of the surface, the body on their left, after a check of all edges.
 
     Raises:
-        ValueError: if two triangles lie on the same side of an edge: if each is counter-clockwise, an edge runs one way
-            in one of its triangles and the other way in the other.
+        ValueError: if two elements lie on the same side of an edge: if each is counter-clockwise, an edge runs one way
+            in one of its elements and the other way in the other.
     """
-    a, b = elements[:, EDGES].reshape(-1, 2).T.astype(np.int64)
+    kind = element_of(elements).name
+    corners = elements[:, : element_of(elements).corners]
+    a, b = elements[:, element_of(elements).sides].reshape(-1, 2).T.astype(np.int64)
     total = int(elements.max()) + 1
     # One number tells both ends of a side and its direction; those of one edge are neighbours when sorted.
     sides = np.sort((np.minimum(a, b) * total + np.maximum(a, b)) * 2 + (a > b))
@@ -102,16 +110,15 @@ def _surface_of(elements: np.ndarray) -> np.ndarray:
     twice = np.flatnonzero(sides[1:] == sides[:-1])
     if twice.size:
         ends = divmod(int(edge[twice[0]]), total)
-        those = np.flatnonzero(np.isin(elements[:, :3], ends).sum(axis=1) == 2)
-        corners = np.sort(elements[those, :3], axis=1)
-        if len(np.unique(corners, axis=0)) < len(those):
+        those = np.flatnonzero(np.isin(corners, ends).sum(axis=1) == 2)
+        if len(np.unique(np.sort(corners[those], axis=1), axis=0)) < len(those):
             k = those[0]
             raise ValueError(
-                f"elements: triangle {k}, {elements[k].tolist()}, is listed more than once; remove the copies"
+                f"elements: {kind} {k}, {elements[k].tolist()}, is listed more than once; remove the copies"
             )
         raise ValueError(
-            f"elements: triangles {those.tolist()} meet in the edge between nodes {ends[0]} and {ends[1]}, and two of "
-            f"them lie on the same side of it; triangles must not overlap"
+            f"elements: {kind}s {those.tolist()} meet in the edge between nodes {ends[0]} and {ends[1]}, and two of "
+            f"them lie on the same side of it; {kind}s must not overlap"
         )
     shared = np.append(edge[1:] == edge[:-1], False)
     alone = ~(shared | np.roll(shared, 1))
@@ -121,11 +128,12 @@ def _surface_of(elements: np.ndarray) -> np.ndarray:
 
 
 def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) -> None:
-    """Refuse triangles that overlap, from the surface `edges` alone, of triangles that are counter-clockwise.
+    """Refuse elements that overlap, from the surface `edges` alone, of elements that are counter-clockwise.
 
-    So many triangles lie over a point as the surface winds round it. That number changes only across the surface: it is
+    So many elements lie over a point as the surface winds round it. That number changes only across the surface: it is
     at most 1 if no two edges of the surface cross, and it is 1 beside each of them.
     """
+    kind = element_of(elements).name
     # Measured from one of its nodes, wherever the body lies.
     begin, end = (nodes[edges[:, k]] - nodes[edges[0, 0]] for k in (0, 1))
     extent = np.ptp(begin, axis=0)
@@ -137,13 +145,13 @@ def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) 
     if first.size:
         here, there = edges[first[0]].tolist(), edges[second[0]].tolist()
         raise ValueError(
-            f"elements: triangles overlap: the edge between nodes {here[0]} and {here[1]} of the surface crosses that "
+            f"elements: {kind}s overlap: the edge between nodes {here[0]} and {here[1]} of the surface crosses that "
             f"between nodes {there[0]} and {there[1]}"
         )
     covered = np.flatnonzero(_windings(begin, end) > 1)
     if covered.size:
         a, b = edges[covered[0]].tolist()
-        raise ValueError(f"elements: triangles overlap: others lie over that at the edge between nodes {a} and {b}")
+        raise ValueError(f"elements: {kind}s overlap: others lie over that at the edge between nodes {a} and {b}")
 
 
 def _crossing(begin: np.ndarray, end: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, pytree, to_device
-from jaxbeam.mesh.elements import element_of
+from jaxbeam.mesh.elements import ELEMENTS, element_of
 from jaxbeam.mesh.geometry import SLIVER, _areas, _check_geometry, _check_overlaps, _check_topology, _surface_of
 
 
@@ -44,7 +44,8 @@ class Mesh:
     radian: ClassVar[Any] = None
 
     def __post_init__(self) -> None:
-        elements = checks.whole_numbers("elements", self.elements, "(t, 3) or (t, 6)", (3, 6))
+        shapes = " or ".join(f"(t, {nodes})" for nodes in ELEMENTS)
+        elements = checks.whole_numbers("elements", self.elements, shapes, tuple(ELEMENTS))
         nodes = float_nodes(self.nodes, 2, "(x, y)")
         _check_topology(nodes.shape[0], elements)
         if is_concrete(nodes):
@@ -66,8 +67,8 @@ class Mesh:
         if not all(hasattr(each, "shape") for each in (self.nodes, self.elements)):
             return "a tree of other values"
         count, nodes = self.elements.shape
-        kind = "triangles" if self.radian is None else "elements"
-        return f"{len(self.nodes)} nodes, {count} {kind} of {nodes} nodes, {self.nodes.dtype}"
+        kind = element_of(self.elements).name if self.radian is None else "element"
+        return f"{len(self.nodes)} nodes, {count} {kind}s of {nodes} nodes, {self.nodes.dtype}"
 
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import namespace
-from jaxbeam.mesh.elements import FOUR_PARTS, QUADRATIC_TRIANGLE, TRIANGLE, Element, element_of
+from jaxbeam.mesh.element import Element
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 
 
@@ -19,25 +20,28 @@ def quadratic(mesh: Mesh) -> Mesh:
     Differentiable in the nodes.
 
     Raises:
-        ValueError: if the triangles have six nodes already, or it is not made of triangles.
+        ValueError: if the elements have so many nodes already, or it is the line of a rod.
     """
     check_triangles(mesh)
-    if element_of(mesh.elements) is not TRIANGLE:
-        raise ValueError("mesh: its triangles have six nodes already")
-    return _made(mesh, with_middle_nodes(mesh.elements, len(mesh.nodes)))
+    element = element_of(mesh.elements)
+    if element.enriched is None:
+        raise ValueError(
+            f"mesh: there is no {element.name} with more than its {element.nodes} nodes; use refined(mesh)"
+        )
+    return _made(mesh, enriched_elements(mesh.elements, len(mesh.nodes)))
 
 
 @usual_rules
 def refined(mesh: Mesh) -> Mesh:
-    """The mesh with every triangle cut into four by the middles of its edges, four in the place of one.
+    """The mesh with every element cut into four by the middles of its edges, four in the place of one.
 
-    Nodes keep their numbers. Six-node triangles keep the shape of their edges. Differentiable in the nodes.
+    Nodes keep their numbers, and curved edges their shape. Differentiable in the nodes.
 
     Raises:
-        ValueError: if it is not made of triangles.
+        ValueError: if it is the line of a rod.
     """
     check_triangles(mesh)
-    return _made(mesh, cut_in_four(mesh.elements, len(mesh.nodes)))
+    return _made(mesh, cut_elements(mesh.elements, len(mesh.nodes)))
 
 
 class Finer(NamedTuple):
@@ -54,37 +58,37 @@ class Finer(NamedTuple):
         return xp.sum(self.weights[:, :, None].astype(field.dtype) * xp.asarray(field)[self.nodes], axis=1)
 
 
-def with_middle_nodes(elements: np.ndarray, count: int) -> Finer:
-    """Triangles of three nodes as triangles of six."""
-    return _divided(elements, count, QUADRATIC_TRIANGLE, np.eye(3)[None])
-
-
-def cut_in_four(elements: np.ndarray, count: int) -> Finer:
-    """Each triangle as four of the same kind, cut by the middles of its edges."""
-    return _divided(elements, count, element_of(elements), FOUR_PARTS)
+def cut_elements(elements: np.ndarray, count: int) -> Finer:
+    """The elements of `count` nodes, each cut into its children."""
+    element = element_of(elements)
+    return _divided(elements, count, element, element.children)
 
 
 def enriched_elements(elements: np.ndarray, count: int) -> Finer:
-    """The finer elements by which the error of a mesh is estimated: six nodes in place of three, or four parts."""
-    return with_middle_nodes(elements, count) if element_of(elements) is TRIANGLE else cut_in_four(elements, count)
+    """The finer elements by which the error of a mesh is estimated: with more nodes, or else cut into children."""
+    element = element_of(elements)
+    if element.enriched is None:
+        return cut_elements(elements, count)
+    return _divided(elements, count, element.enriched, np.eye(element.corners)[None])
 
 
 def _divided(elements: np.ndarray, count: int, target: Element, parts: np.ndarray) -> Finer:
-    """Elements of `count` nodes cut into `parts` `(c, 3, 3)`, given by their corners, each of the kind `target`.
+    """Elements of `count` nodes cut into `parts` `(p, c, c)`, given by their corners, each of the kind `target`.
 
     Nodes keep their numbers, and new ones follow.
     """
     old = element_of(elements)
-    places = np.einsum("kp,cpl->ckl", target.places, parts).reshape(-1, 3)
+    places = np.einsum("kp,cpl->ckl", target.places, parts).reshape(-1, old.corners)
     # Parts share nodes with each other, and elements with their neighbours. A node is known by the corners of its
-    # element that it lies between, with their weights in quarters.
-    quarters = np.round(4 * places).astype(np.int64)
-    keys = np.sort(np.where(quarters > 0, elements[:, None, :3].astype(np.int64) * 4 + quarters, -1), axis=2)
-    same = (np.abs(places[:, None] - old.places).max(axis=2) < 0.125).T
+    # element that it lies between, with their weights: multiples of a quarter on triangles,
+    # and of a sixteenth on quadrilaterals.
+    shares, corners = np.round(64 * places).astype(np.int64), elements[:, None, : old.corners].astype(np.int64)
+    keys = np.sort(np.where(shares > 0, corners * 128 + shares, -1), axis=2)
+    same = (np.abs(places[:, None] - old.places).max(axis=2) < 1e-3).T
     known, which = same.any(axis=0), same.argmax(axis=0)
     whole = np.empty((len(elements), len(places)), np.int64)
     whole[:, known] = elements[:, which[known]]
-    rows = keys[:, ~known].reshape(-1, 3)
+    rows = keys[:, ~known].reshape(-1, old.corners)
     _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     new = int((~known).sum())
     whole[:, ~known] = count + number.reshape(-1, new)

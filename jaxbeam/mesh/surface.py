@@ -17,7 +17,8 @@ from functools import lru_cache
 import numpy as np
 
 from jaxbeam.core.tree import Key, is_concrete, key_of, read_only
-from jaxbeam.mesh.elements import edge_functions, element_of
+from jaxbeam.mesh.element import edge_functions
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
 
 # Gauss's rule of two points on (0, 1): exact for a shape function times the tent.

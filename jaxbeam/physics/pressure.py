@@ -22,7 +22,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
-from jaxbeam.mesh.elements import edge_products
+from jaxbeam.mesh.element import edge_products
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.surface import surface
 from jaxbeam.physics.energy import Energy, Term, check_nodes

@@ -13,7 +13,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace
-from jaxbeam.mesh.elements import degree_of, element_of, rule
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.physics import quadrature
 from jaxbeam.physics.energy import Energy, Term
@@ -61,7 +61,8 @@ class SolidEnergy(Energy):
 
     def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
         material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), parts, axis=0), term.params.material)
-        return solid(mesh, material, self.density, max(degree_of(term.params.weights.shape[1]), 2))
+        degree = element_of(term.nodes).degree_of(term.params.weights.shape[1])
+        return solid(mesh, material, self.density, max(degree, element_of(mesh.elements).degree))
 
     def at_points(self, x: jax.Array, params: SolidParams, measure: Callable[..., jax.Array]) -> jax.Array:
         def one(x: jax.Array, params: SolidParams) -> jax.Array:
@@ -97,17 +98,18 @@ def solid(
     Args:
         mesh: with nodes `(n, 2)`; differentiable in them.
         params: the density's parameters, such as `lame(young, poisson)`: a pytree whose leaves are scalars
-            or have leading axis `t`, one entry for each triangle. Cast to the dtype of the nodes.
+            or have leading axis `t`, one entry for each element. Cast to the dtype of the nodes.
         density: `(H, params) -> scalar`, one of `jaxbeam.physics.materials` or your own module-level function.
-        degree: of the polynomials in the density that the quadrature takes exactly, of `jaxbeam.elements.DEGREES`. By
-            default 1 (one point) for triangles of three nodes, where that is exact for any density, and 2 (three
-            points) for six.
+        degree: of the polynomials in the density that the quadrature takes exactly, one that the element has a rule
+            for: 1, 2, 4 or 5. By default 1 (one point) for triangles of three nodes, where that is exact for any
+            density, and 2 (three points) for six.
 
     Raises:
         ValueError: if a parameter is neither a scalar nor of leading axis `t` or is not finite, there is no rule of
             that degree, or the density returns no scalar or is not that of `H = F - I`.
     """
     check_triangles(mesh)
+    element = element_of(mesh.elements)
     total, dtype = mesh.elements.shape[0], mesh.nodes.dtype
     xp = namespace(mesh.nodes, *jax.tree.leaves(params))
 
@@ -118,16 +120,15 @@ def solid(
             return xp.full((total,), array)
         if array.shape[0] != total:
             raise ValueError(
-                f"{name}: expected a scalar or {total} entries, one for each triangle, got shape {array.shape}"
+                f"{name}: expected a scalar or {total} entries, one for each {element.name}, got shape {array.shape}"
             )
         return array
 
     material = jax.tree_util.tree_map_with_path(per_element, params)
     check_density(density, material)
     rest = xp.asarray(mesh.nodes)[mesh.elements]
-    element = element_of(mesh.elements)
-    points, shares = rule(element.degree if degree is None else checks.count("degree", degree, 1))
-    # How a triangle is mapped from the reference one, and the inverse of that, at each point.
+    points, shares = element.rule(element.degree if degree is None else checks.count("degree", degree, 1))
+    # How an element is mapped from the reference one, and the inverse of that, at each point.
     slopes = xp.asarray(element.slopes(points), dtype)
     # From the first node, so that a place far from the origin costs no digits.
     map_ = xp.einsum("mkd,qki->mqdi", rest - rest[:, :1], slopes)
@@ -135,5 +136,5 @@ def solid(
     inverse = xp.stack([map_[..., 1, 1], -map_[..., 0, 1], -map_[..., 1, 0], map_[..., 0, 0]], axis=-1)
     inverse = inverse.reshape(map_.shape) / determinant[..., None, None]
     gradients = xp.einsum("qki,mqid->mqkd", slopes, inverse)
-    weights = 0.5 * xp.asarray(shares, dtype) * determinant
+    weights = element.area * xp.asarray(shares, dtype) * determinant
     return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, weights, material))

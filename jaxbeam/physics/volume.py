@@ -1,8 +1,8 @@
 """`J = det F` of elements: its smallest value anywhere, and how far a step may go before it falls too low.
 
-In an element of three nodes `J` is one number. In one of six it is a ratio of quadratic polynomials, whose smallest
-value is found exactly (`jaxbeam.mesh.bernstein`): quadrature points alone do not show that an element is turned inside
-out between them.
+In a triangle of three nodes `J` is one number. In other elements it is a ratio of two polynomials, whose smallest value
+the element's record finds (`jaxbeam.mesh.element`). The quadrature points alone do not show that an element is turned
+inside out between them.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxbeam.mesh.bernstein import least_ratio, minimiser, value
-from jaxbeam.mesh.elements import corner_slopes, determinants, element_of
+from jaxbeam.mesh.element import Determinant, least_ratio
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.quadrature import SolidParams, interpolated, shape_gradients
 
 
@@ -25,29 +25,34 @@ def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
 def smallest_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
     """The smallest `J` `(m,)` anywhere in each element, quadrature point or not, at positions `x` `(m, k, 2)`.
 
-    With six nodes it is the smallest ratio of two quadratic polynomials: by how much the present map and that of the
-    rest positions stretch area. Positive just when no part of the element is turned inside out.
+    Unless `J` is constant on an element, it is the smallest ratio of two polynomials: by how much the present map and
+    that of the rest positions stretch area. Positive just when no part of the element is turned inside out.
     """
-    if element_of(x).affine:
+    determinant = element_of(x).determinant
+    if determinant is None:
         return jnp.min(volume_ratios(x, params), axis=0)
-    area = _rest_areas(params)
-    present, rest = (corner_slopes(jnp.moveaxis(places, 0, -1)) for places in (x, params.rest))
-    return least_ratio(*(jnp.stack(determinants(slopes, slopes)) / area for slopes in (present, rest)))
+    return least_ratio(determinant, *(_stretch(determinant, places, params) for places in (x, params.rest)))
 
 
 def rest_is_sound(params: SolidParams) -> jax.Array:
     """Whether each element `(m,)` has positive area, and none of it is turned inside out, at rest."""
     positive = jnp.all(params.weights > 0, axis=1)
-    if element_of(params.rest).affine:
+    determinant = element_of(params.rest).determinant
+    if determinant is None:
         return positive
-    slopes = corner_slopes(jnp.moveaxis(params.rest, 0, -1))
-    stretch = jnp.stack(determinants(slopes, slopes)) / _rest_areas(params)
-    return positive & (value(stretch, minimiser(stretch)) > 0)
+    return positive & (determinant.least(_stretch(determinant, params.rest, params)) > 0)
 
 
-def _rest_areas(params: SolidParams) -> jax.Array:
-    """Twice the area `(1, m)` of each element at rest: of the size of what is divided by it, whatever the unit."""
-    return 2 * jnp.sum(params.weights, axis=1)[None]
+def _stretch(determinant: Determinant, x: jax.Array, params: SolidParams) -> jax.Array:
+    """Coefficients `(b, m)` of the determinant of the map at `x` `(m, k, 2)`, over its mean at rest."""
+    slopes = determinant.slopes(jnp.moveaxis(x, 0, -1))
+    return determinant.coefficients(slopes, slopes) / _rest_stretch(params)
+
+
+def _rest_stretch(params: SolidParams) -> jax.Array:
+    """The mean determinant `(1, m)` of the map of each element at rest. Divided by it, others are of order 1 whatever
+    the unit of length."""
+    return jnp.sum(params.weights, axis=1)[None] / element_of(params.rest).area
 
 
 def admissible_step(
@@ -55,8 +60,8 @@ def admissible_step(
 ) -> jax.Array:
     """Largest `t` `(m,)` for which no point of an element falls below `keep` times its present `J` on `x + t dx`.
 
-    Infinite where `J` never falls so far. Elements of six nodes are not looked at beyond `t = 1`, and away from their
-    quadrature points `J` may fall somewhat lower: to half of `keep` times the smallest `J` in the element.
+    Infinite where `J` never falls so far. Elements on which `J` varies are not looked at beyond `t = 1`, and away from
+    their quadrature points `J` may fall somewhat lower: to half of `keep` times the smallest `J` in the element.
 
     Args:
         x: `(m, k, 2)` positions of the nodes of each element.
@@ -64,7 +69,7 @@ def admissible_step(
         params: of the elements.
         keep: fraction of `J`.
         bound: quadrature points where `J` is at or under it already are left out.
-        inside: of elements of six nodes whose smallest `J` is at or under it only the quadrature points are looked at.
+        inside: of elements whose smallest `J` is at or under it only the quadrature points are looked at.
     """
     gradients = shape_gradients(params)
     H, D = interpolated(gradients, x - params.rest), interpolated(gradients, dx)
@@ -73,31 +78,38 @@ def admissible_step(
     b = F11 * D[0, 0] + F00 * D[1, 1] - H[1, 0] * D[0, 1] - H[0, 1] * D[1, 0]
     c = D[0, 0] * D[1, 1] - D[0, 1] * D[1, 0]
     at_points = _first_crossing((1 - keep) * j, b, c, j > bound)
-    return at_points if element_of(x).affine else _step_within(at_points, x, dx, params, keep, inside)
+    determinant = element_of(x).determinant
+    return at_points if determinant is None else _step_within(determinant, at_points, x, dx, params, keep, inside)
 
 
 def _step_within(
-    start: jax.Array, x: jax.Array, dx: jax.Array, params: SolidParams, keep: float, bound: float
+    determinant: Determinant,
+    start: jax.Array,
+    x: jax.Array,
+    dx: jax.Array,
+    params: SolidParams,
+    keep: float,
+    bound: float,
 ) -> jax.Array:
-    """The largest `t` `(m,)`, up to `start` and 1, by all points of elements of six nodes.
+    """The largest `t` `(m,)`, up to `start` and 1, by all points of elements on which `J` varies.
 
     At each point `J(t) = J + b t + c t^2` is no less than the smallest of `J`, `J + b T / 2` and `J(T)` for `t` up to
-    `T`, its Bernstein coefficients. The last two are quadratic polynomials on the element. `T` is cut to where they
+    `T`, its Bernstein coefficients. The last two are polynomials on the element. `T` is cut to where they
     reach `keep J` at the point where they are below it most, again and again, until they are nowhere below by more than
     half of `keep` times the smallest `J`. Each cut is 2 % at least, so that round-off does not keep it from ending.
     """
-    area = _rest_areas(params)
-    now, step = (corner_slopes(jnp.moveaxis(places, 0, -1)) for places in (x, dx))
-    j, c = (jnp.stack(determinants(slopes, slopes)) / area for slopes in (now, step))
-    b = (jnp.stack(determinants(now, step)) + jnp.stack(determinants(step, now))) / area
+    scale, of, value = _rest_stretch(params), determinant.coefficients, determinant.value
+    now, step = (determinant.slopes(jnp.moveaxis(places, 0, -1)) for places in (x, dx))
+    j, c = (of(slopes, slopes) / scale for slopes in (now, step))
+    b = (of(now, step) + of(step, now)) / scale
     # The axis before the elements: the two coefficients, less `keep J`.
     gap, b, c = (1 - keep) * j[:, None], jnp.stack([b / 2, b], axis=1), jnp.stack([jnp.zeros_like(c), c], axis=1)
     left = lambda t: gap + t[None, None] * (b + t[None, None] * c)
 
     def cut(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         _, t = carry
-        least = value(j, minimiser(j))
-        place = minimiser(left(t))
+        least = determinant.least(j)
+        place = determinant.minimiser(left(t))
         low = value(left(t), place) < jnp.where(least > bound, -0.5 * keep * least, -jnp.inf)[None]
         crossing = _first_crossing(value(gap, place), value(b, place), value(c, place), low)
         return jnp.any(low), jnp.where(jnp.any(low, axis=0), jnp.minimum(0.98 * t, crossing), t)

@@ -11,7 +11,8 @@ import itertools
 import numpy as np
 
 from jaxbeam.core.tree import Numbers
-from jaxbeam.mesh.elements import ELEMENTS, edge_functions, element_of
+from jaxbeam.mesh.element import edge_functions
+from jaxbeam.mesh.elements import ELEMENTS, element_of
 from jaxbeam.mesh.surface import surface, walk
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene

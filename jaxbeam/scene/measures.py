@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.compiling import one_program
-from jaxbeam.mesh.elements import Element, degree_of, element_of, rule
+from jaxbeam.mesh.element import Element
+from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene, placed
 
@@ -99,10 +100,11 @@ def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
 def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
 
-    In each element the linear field that fits the stress at the quadrature points best, by least squares with their
-    weights, is carried to the nodes; at a node the elements that meet there are averaged, weighted by area at rest
-    (local smoothing: Hinton and Campbell 1974, Int. J. Numer. Methods Eng. 8, 461-480). Where two materials meet the
-    stress jumps, and this is a mean of both sides; at a node that no solid reaches it is zero.
+    In each element a field that is linear in the weights of its corners is fitted to the stress at the quadrature
+    points, by least squares with their weights, and carried to the nodes. At a node the elements that meet there are
+    averaged, weighted by area at rest (local smoothing: Hinton and Campbell 1974, Int. J. Numer. Methods Eng. 8,
+    461-480). Where two materials meet the stress jumps, and this is a mean of both sides. At a node that no solid
+    reaches it is zero.
 
     Raises:
         ValueError: if the scene has no solid, or a solid has quadrature points of a rule that is not in
@@ -154,10 +156,10 @@ def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]
 
 
 def _points_to_nodes(element: Element, points: int) -> np.ndarray:
-    """The matrix `(k, q)` from values at `q` quadrature points to those of the linear field that fits them best, at
-    the `k` nodes of the element. Fewer than three points do not fix a linear field: of those that fit the least is
-    taken, which for one point is constant."""
-    places, shares = rule(degree_of(points))
+    """The matrix `(k, q)` from values at `q` quadrature points to those of the field that fits them best, at the `k`
+    nodes of the element. The field is linear in the weights of the corners. Too few points do not fix it: of those
+    that fit the least is taken, which for one point is constant."""
+    places, shares = element.rule(element.degree_of(points))
     root = np.sqrt(shares)
     return element.places @ (np.linalg.pinv(root[:, None] * places) * root)
 

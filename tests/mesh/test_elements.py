@@ -7,19 +7,20 @@ import pytest
 from helpers import EPS, central_difference
 
 import jaxbeam as jb
-from jaxbeam.mesh.elements import DEGREES, ELEMENTS, rule
+from jaxbeam.mesh.elements import ELEMENTS
+from jaxbeam.mesh.triangle import RULES, TRIANGLE
 from jaxbeam.physics.volume import admissible_step, smallest_ratios, volume_ratios
 from jaxbeam.scene.scene import is_valid
 
 # ------------------------------------------------------------------------------- rules and shape functions
 
 
-@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("degree", RULES)
 def test_rule_is_exact_up_to_its_degree(degree):
     """Against `int l0^a l1^b l2^c = a! b! c! 2 A / (a + b + c + 2)!`, and not beyond."""
     from math import factorial
 
-    points, weights = rule(degree)
+    points, weights = TRIANGLE.rule(degree)
     assert weights.sum() == pytest.approx(1, abs=1e-14) and (weights > 0).all()
     off = {}
     for total in range(degree + 2):

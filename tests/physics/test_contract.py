@@ -95,6 +95,11 @@ def test_what_it_says_of_ranges_and_bounds_is_heard():
     assert float(largest_step(SCENE, BEAM.mesh.nodes, 1e-9 * BEAM.mesh.nodes, 0.1)) == 0.25
 
 
+def test_bounds_of_commands_are_in_the_range_of_each_kind():
+    with pytest.raises(ValueError, match=r"expected \[-inf, 0.0\] < low <= high, got low \[-5.0, -0.5\]"):
+        jb.reach(SCENE, 1.0, bounds=([-5.0, -0.5], [50.0, 1.0]))
+
+
 def test_it_is_drawn_under_its_own_name():
     assert line_names(SCENE) == ["wire 1", "tendon 2"]
     ax = plot.beam(SCENE, BEAM.mesh.nodes)
