@@ -1,1 +1,1 @@
-"""What is asked of JAX and of the user: pytrees, compilation, derivative rules, checks of arguments."""
+"""Pytrees, compilation, derivative rules, and checks of arguments."""

@@ -1,9 +1,9 @@
-"""Checks of what a person passes to a public function: each names the argument, what was expected, what came, the cure.
+"""Checks of the arguments of public functions. An error names the argument, what was expected, what came and the cure.
 
-Numbers that are known are checked on the host. Of traced ones only the shape and the dtype are known; where a value
-turns out to lie outside its range it becomes NaN, which spreads to the parameters made of it, and a scene with such a
-parameter is solved with the status `INVALID`. So what is refused when it is concrete is `INVALID` when it is traced.
-Derivatives by values in their range pass through; by others they are NaN.
+Concrete numbers are checked on the host. Of traced numbers only the shape and the dtype are known. A traced value
+outside its range becomes NaN. The NaN spreads to the parameters computed from it, and a scene with such a parameter is
+solved with the status `INVALID`. So an argument that is refused when concrete gives `INVALID` when traced. Derivatives
+with respect to a traced value are unchanged inside its range and NaN outside.
 """
 
 from __future__ import annotations
@@ -21,9 +21,13 @@ T = TypeVar("T")
 
 
 class Range(NamedTuple):
-    """The numbers from `low`, which belongs to them if it is `closed`, up to `high`, which does not.
+    """An interval: `low < value < high`, or `low <= value < high` if `closed`.
 
-    one, many: what to call one of them, and several.
+    one: words for one number of the interval.
+    many: words for several of them.
+    low: lower bound.
+    high: upper bound, excluded.
+    closed: whether `low` belongs to the interval.
     """
 
     one: str
@@ -38,21 +42,15 @@ class Range(NamedTuple):
 
 
 FINITE = Range("a finite number", "finite numbers")
-
-
 POSITIVE = Range("a positive finite number", "positive finite numbers", low=0)
-
-
 NOT_NEGATIVE = Range("a finite number of at least 0", "finite numbers of at least 0", low=0, closed=True)
-
-
 SHARE = Range("a number between 0 and 1", "numbers between 0 and 1", low=0, high=1)
 
 
 Shape = tuple[int, ...]
 
 
-# Arrays of no more entries are shown whole.
+# Error messages show arrays of up to this many entries in full.
 SMALL = 8
 
 
@@ -67,24 +65,24 @@ def numbers(
     each: str = "",
     why: str = "",
 ) -> Any:
-    """Real numbers within a range: a NumPy array, or a traced one in which NaN stands for what lies outside.
+    """Check real numbers. Returns a NumPy array, or a traced array with NaN for values outside the range.
 
     Args:
-        name: of the argument.
+        name: name of the argument.
         value: what was passed for it.
         within: the range.
-        shapes: those that it may have; any by default.
-        each: what there is an entry for, such as "one for each tendon".
+        shapes: the shapes allowed; any by default.
+        each: what an entry stands for, such as "one for each tendon".
         why: the reason for the range, or the cure.
 
     Raises:
-        ValueError: that names the argument.
+        ValueError: the dtype or the shape is wrong, or a concrete number lies outside the range.
     """
     return inside(name, shaped(name, value, shapes, each), within, within.many, why)
 
 
 def number(name: str, value: Any, within: Range = FINITE, why: str = "") -> Any:
-    """One real number within a range; otherwise as `numbers`."""
+    """Check one real number, as `numbers` does for arrays."""
     array = real(name, value, "a real number")
     if array.ndim:
         raise ValueError(f"{name}: expected {within.one}, got {_shown(value)}")
@@ -92,14 +90,14 @@ def number(name: str, value: Any, within: Range = FINITE, why: str = "") -> Any:
 
 
 def setting(name: str, value: Any, within: Range = FINITE, why: str = "") -> float:
-    """One real number that must be known, because the host or the compiler needs its value."""
+    """Check one real number that must be concrete, because the host or the compiler needs its value."""
     if not is_concrete(value):
         raise ValueError(f"{name}: expected {within.one}, got a traced value; give a Python number")
     return float(number(name, value, within, why))
 
 
 def inside(name: str, array: Any, within: Range, words: str = "", why: str = "") -> Any:
-    """Real numbers as `real` returns them, within a range."""
+    """Check the range of an array from `real`. The message calls the range `words`, by default `within.many`."""
     if isinstance(array, Tracer):
         floats = array if array.dtype.kind == "f" else array.astype(jnp.result_type(float))
         return poisoned(floats, within.holds(floats))
@@ -113,12 +111,12 @@ def inside(name: str, array: Any, within: Range, words: str = "", why: str = "")
 
 
 def poisoned(values: jax.Array, good: jax.Array) -> jax.Array:
-    """Traced values where they are good, elsewhere NaN, and so are their derivatives: zero would pass for an answer."""
+    """Traced values where they are good, else NaN. Derivatives are NaN there too: zeros would look like results."""
     return values * jnp.where(good, 1.0, jnp.nan)
 
 
 def shaped(name: str, value: Any, shapes: tuple[Shape, ...] | None, each: str = "") -> Any:
-    """Real numbers of one of these shapes, in any range."""
+    """Check real numbers of one of these shapes. Their range is not checked."""
     array = real(name, value)
     if shapes is not None and array.shape not in shapes:
         entries = [f"{shape[0]} entries" if len(shape) == 1 else f"shape {shape}" for shape in shapes[1:]]
@@ -131,7 +129,7 @@ def shaped(name: str, value: Any, shapes: tuple[Shape, ...] | None, each: str = 
 
 
 def real(name: str, value: Any, expected: str = "real numbers") -> Any:
-    """What was passed as a NumPy array of floats or whole numbers; traced values as a JAX array."""
+    """Convert to an array of floats or whole numbers: of NumPy if the values are concrete, of JAX if traced."""
     array = plain(name, value, expected)
     if array.dtype.kind not in "fiu" or (array.dtype.itemsize < 4 and array.dtype.kind == "f"):
         raise ValueError(f"{name}: expected {expected}, got {_shown(value, array)}; {_cure(array.dtype)}")
@@ -139,7 +137,7 @@ def real(name: str, value: Any, expected: str = "real numbers") -> Any:
 
 
 def plain(name: str, value: Any, expected: str) -> Any:
-    """What was passed as an array of any dtype."""
+    """Convert to an array of any dtype: of NumPy if the values are concrete, of JAX if traced."""
     if isinstance(value, Tracer):
         return value
     if isinstance(value, np.ma.MaskedArray):
@@ -157,7 +155,7 @@ def plain(name: str, value: Any, expected: str) -> Any:
 
 
 def _shown(value: Any, array: Any = None) -> str:
-    """What came, in a few words."""
+    """Short description of what was passed."""
     if array is not None and array.ndim and array.dtype.kind != "O":
         return f"dtype {array.dtype}"
     text = repr(value)
@@ -165,7 +163,7 @@ def _shown(value: Any, array: Any = None) -> str:
 
 
 def _cure(dtype: Any) -> str:
-    """What to do with numbers of a dtype that is refused."""
+    """How to convert numbers of a dtype that is refused."""
     if dtype.kind == "c":
         return "take the real part with .real"
     if dtype.kind == "f" or "float" in str(dtype):
@@ -177,7 +175,7 @@ def _cure(dtype: Any) -> str:
 
 
 def count(name: str, value: Any, least: int, most: int | None = None, why: str = "") -> int:
-    """A whole number."""
+    """Check a whole number from `least` to `most`, both included."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < least or (most is not None and value > most):
         span = f"of at least {least}" if most is None else f"from {least} to {most}"
@@ -186,28 +184,28 @@ def count(name: str, value: Any, least: int, most: int | None = None, why: str =
 
 
 def flag(name: str, value: Any) -> bool:
-    """True or False, and not what merely counts as such, for that includes every text."""
+    """Check `True` or `False`. Other values are refused: a string such as "no" counts as true in Python."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name}: expected True or False, got {_shown(value)}")
     return bool(value)
 
 
 def function(name: str, value: Any, form: str) -> Any:
-    """Something that can be called, as `form` says."""
+    """Check that `value` can be called. `form` shows its arguments in the message."""
     if not callable(value):
         raise ValueError(f"{name}: expected a function {form}, got {_shown(value)}")
     return value
 
 
 def scalar(name: str, form: str, value: Any, *arguments: Any) -> None:
-    """Refuse a function that does not return one real number for such arguments. It is traced, not run."""
+    """Refuse a function `value` that does not return one real number for these arguments. It is traced, not run."""
     found = jax.eval_shape(value, *arguments)
     if getattr(found, "shape", None) != () or found.dtype.kind != "f":
         raise ValueError(f"{name}: expected a function {form} that returns one real number, got {found}")
 
 
 def parameter(name: str, value: Any) -> Any:
-    """A leaf of the parameters of a term: numbers, or booleans, that can be computed with."""
+    """Check one leaf of the parameters of a term: an array of real numbers or booleans, and not of float16."""
     array = value if isinstance(value, jax.Array | np.ndarray) else plain(name, value, "numbers")
     if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub" or array.dtype in (np.float16,):
         real(name, value)
@@ -215,7 +213,7 @@ def parameter(name: str, value: Any) -> Any:
 
 
 def instance(name: str, value: T, kind: type, cure: str) -> T:
-    """An object of a class."""
+    """Check that `value` is an instance of the class `kind`."""
     if not isinstance(value, kind):
         got = f"the class {value.__name__} itself" if isinstance(value, type) else f"a {type(value).__name__}"
         raise ValueError(f"{name}: expected a {kind.__name__}, got {got}; {cure}")
@@ -223,7 +221,7 @@ def instance(name: str, value: T, kind: type, cure: str) -> T:
 
 
 def float_dtype(name: str, value: Any) -> Any:
-    """A dtype to compute in: that of JAX's floats if none is given, else float32 or float64."""
+    """Check a dtype to compute in: float32 or float64. `None` gives JAX's default float dtype."""
     if value is None:
         return jnp.result_type(float)
     try:
@@ -239,7 +237,7 @@ def float_dtype(name: str, value: Any) -> Any:
 
 
 def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
-    """Numbers of some of `total` nodes, in an array of `ndim` axes that is not empty."""
+    """Check node numbers from 0 to `total - 1`, in an array of `ndim` axes that is not empty."""
     if not is_concrete(value):
         raise ValueError(f"{name}: expected concrete node numbers, got a traced array")
     shape = "(m,)" if ndim == 1 else "(m, k)"
@@ -257,7 +255,7 @@ def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
 
 
 def whole_numbers(name: str, value: Any, shape: str, columns: tuple[int, ...]) -> np.ndarray:
-    """Rows of whole numbers, at least one, with one of these numbers of columns: an array fit to be structure."""
+    """Check node numbers `(m, c)` with `m >= 1` and `c` in `columns`. Returns a read-only array for an index field."""
     if not is_concrete(value):
         raise ValueError(f"{name}: expected concrete node numbers, got a traced array; build the topology outside")
     array = plain(name, value, f"whole numbers of shape {shape}")
@@ -271,11 +269,14 @@ def whole_numbers(name: str, value: Any, shape: str, columns: tuple[int, ...]) -
 
 
 def positions(name: str, value: Any, shape: Shape, dtype: Any) -> jax.Array:
-    """Positions of all nodes as a JAX array: one of floats as it is, other numbers as one of `dtype`."""
+    """Check positions of all nodes.
+
+    A JAX array of floats is returned as it is. Plain numbers are converted to a JAX array of `dtype`.
+    """
     expected = f"node positions of shape {shape}"
     if hasattr(value, "status") and hasattr(value, "x"):
         raise ValueError(f"{name}: expected {expected}, got a {type(value).__name__}; give its positions, solution.x")
-    # Not brought to the host: it may not be computed yet.
+    # Do not copy a JAX array to the host: that would wait until it is computed.
     array = value if isinstance(value, jax.Array) else real(name, value, expected)
     if (array.dtype.kind != "f" and isinstance(value, jax.Array)) or array.dtype.itemsize < 4:
         raise ValueError(f"{name}: expected {expected}, got dtype {array.dtype}; {_cure(array.dtype)}")

@@ -1,4 +1,4 @@
-"""How programs are compiled and run: options of XLA, JAX's settings, and loops that skip what is not needed."""
+"""How programs are compiled and run: XLA's options, JAX's settings, and a branch that costs nothing when not taken."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ P = ParamSpec("P")
 
 
 def zeros_like_result(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Zeros in the shape of a function's result: a value to start a loop with. The function is traced, not run."""
+    """Zeros with the structure of a function's result, to start a loop with. The function is traced, not run."""
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
 
 
@@ -32,16 +32,16 @@ def compute_if(condition: jax.Array | bool, compute: Callable[..., T], otherwise
     both sides in every lane.
 
     Args:
-        condition: `()` traced, or a plain boolean, which is decided while tracing.
-        compute: must depend on its arguments alone.
-        otherwise: a tree of the same structure as its result.
-        arguments: of `compute`.
+        condition: `()` traced boolean, or a Python boolean, which is decided while tracing.
+        compute: a function that depends on its arguments alone.
+        otherwise: a tree with the structure, shapes and dtypes of the result of `compute`.
+        arguments: the arguments of `compute`.
     """
     if isinstance(condition, bool):
         return compute(*arguments) if condition else otherwise
 
     def iteration(carry: tuple[T, jax.Array]) -> tuple[T, jax.Array]:
-        # Without the barrier XLA moves what does not change out of the loop, and computes it always.
+        # Without the barrier XLA moves operations that do not depend on the carry out of the loop: they always run.
         _, inside = lax.optimization_barrier((carry, arguments))
         return compute(*inside), jnp.zeros((), bool)
 
@@ -49,25 +49,21 @@ def compute_if(condition: jax.Array | bool, compute: Callable[..., T], otherwise
 
 
 def choose(condition: jax.Array, yes: T, no: T) -> T:
-    """`jnp.where` for trees: one of two trees of the same structure, by a traced `()` boolean."""
+    """`jnp.where` for trees: `yes` if the traced `()` condition holds, else `no`, which has the same structure."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 # With these options XLA compiles the solver's many small kernels in less than half the time, and they run no slower.
-# They select its older emitters. They disable two passes that find nothing in the solver's loops, and one that splits
-# each sum in two to lower a round-off that the line search allows for anyway.
+# The first option selects XLA's older emitters. The second disables three passes: two find nothing in the solver's
+# loops; the third splits each sum in two to lower round-off, which the line search allows for anyway.
 _DISABLED_PASSES = "while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
-
-
 _FAST_COMPILATION = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": _DISABLED_PASSES}
-
-
-# Other versions may not know these options.
+# Other versions of JAX may not know these options.
 COMPILER_OPTIONS = _FAST_COMPILATION if (0, 10) <= jax.__version_info__ < (0, 11) else None
 
 
 def is_outermost() -> bool:
-    """Whether no transformation is under way. Inside one, a jitted function returns a tracer."""
+    """Whether the caller is outside every transformation. Inside one, a jitted function returns a tracer."""
     return is_concrete(_zero())
 
 
@@ -76,7 +72,7 @@ _zero = jax.jit(lambda: np.int32(0))
 
 @contextlib.contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """Context without Python's search for reference cycles: it takes a tenth of the time of tracing and finds none."""
+    """Context with Python's cycle collector off: it takes a tenth of the time of tracing and finds no cycles."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -87,7 +83,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 def _rules_are_usual() -> bool:
-    """Whether JAX's default rules for ranks, dtypes and transfers hold here."""
+    """Whether JAX's default rules for ranks, dtypes and transfers are in force."""
     ways = ("host_to_device", "device_to_device", "device_to_host")
     guards = {getattr(jax.config, f"jax_transfer_guard_{way}") for way in ways}
     ranks, dtypes = (getattr(jax.config, f"jax_numpy_{kind}_promotion") for kind in ("rank", "dtype"))
@@ -103,7 +99,7 @@ def usual_rules(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> T:
-        # Mostly nothing is to be changed, and to enter three contexts takes longer than the checks of arguments.
+        # Usually the rules are the default. Entering three contexts takes longer than the checks of arguments.
         if _rules_are_usual():
             return function(*arguments, **named)
         with (
@@ -151,16 +147,16 @@ def compiled(*static: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
 
 def one_program(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: under the usual rules and, outside of every transformation, as one jitted program of its arguments.
+    """Decorator: run under JAX's default rules and, outside every transformation, as one jitted program.
 
-    Operation by operation JAX would compile a program for each: the first tip angle took 0.8 s.
+    Without jit JAX compiles a program for each operation: the first tip angle took 0.8 s.
     """
     jitted = jax.jit(function, compiler_options=COMPILER_OPTIONS)
 
     @functools.wraps(function)
     @usual_rules
     def call(*arguments: P.args, **named: P.kwargs) -> T:
-        # Of anything but arrays of numbers the function says itself what it expected.
+        # Other arguments go to the function itself, whose checks say what it expected.
         if all(map(_is_array, jax.tree.leaves((arguments, named)))) and is_outermost():
             return jitted(*arguments, **named)
         return function(*arguments, **named)
@@ -169,16 +165,16 @@ def one_program(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _is_array(leaf: Any) -> bool:
-    """Whether a leaf is an array of real numbers, and known."""
+    """Whether a leaf is a concrete array of real numbers or booleans."""
     plain = type(leaf) is np.ndarray or (isinstance(leaf, jax.Array) and is_concrete(leaf))
     return plain and leaf.dtype.kind in "biuf"
 
 
 def _refuse_device_varying(values: Any) -> None:
-    """Refuse values that `jax.shard_map` marks as different on each device: a loop that starts from constants fails."""
+    """Refuse values that `jax.shard_map` marks as different on each device: loops that start from constants fail."""
     for leaf in jax.tree.leaves(values):
         kind = jax.typeof(leaf) if isinstance(leaf, Tracer) else None
-        # The second name is that of jax 0.10 and later.
+        # JAX 0.10 and later use the second name.
         if getattr(kind, "vma", None) or getattr(getattr(kind, "manual_axis_type", None), "varying", None):
             raise ValueError(
                 "jax.shard_map: the solver's loops start from constants, which its check of varying values refuses; "

@@ -1,9 +1,9 @@
 """Functions with a derivative rule of their own, to any order and under every transformation.
 
-`jax.custom_jvp` is not enough for a rule that calls its own function again, as that of an implicit function does. Where
-JAX partially evaluates the body of a scan (in reverse mode under `lax.map`, `lax.scan` or `jax.checkpoint`) it keeps
-what the rule computes and drops the rule itself. What the rule calls again is then differentiated as it is written, and
-second derivatives are wrong without a word. A primitive keeps its rule.
+`jax.custom_jvp` fails for a rule that calls its own function again, as the rule of an implicit function does. In
+reverse mode under `lax.map`, `lax.scan` or `jax.checkpoint`, JAX partially evaluates the body. It then keeps the
+operations of the rule and drops the rule itself. A second differentiation differentiates the code of the inner call
+instead of using its rule, and second derivatives are silently wrong. A primitive keeps its rule.
 """
 
 from __future__ import annotations
@@ -22,38 +22,41 @@ from jaxbeam.core.compiling import usual_rules
 
 T = TypeVar("T")
 
-
+# Levels of `jax.vmap`, innermost first: the mapped axis of each leaf, `None` for a leaf that is not mapped.
 Axes = tuple[tuple[int | None, ...], ...]
 
 
 class custom_derivative(Generic[T]):
-    """Decorator: a function of pytrees of arrays whose derivative is what `defjvp` says, like `jax.custom_jvp`.
+    """Decorator: a function of pytrees of arrays with the derivative rule set by `defjvp`, as in `jax.custom_jvp`.
 
     Args:
-        function: of `static` hashable arguments, which come first, and then of pytrees of arrays.
-        static: how many of the arguments are hashable values and no arrays.
+        function: takes `static` hashable arguments first, then pytrees of arrays.
+        static: number of leading arguments that are hashable values instead of arrays.
     """
 
     def __init__(self, function: Callable[..., T], static: int = 0) -> None:
         functools.update_wrapper(self, function)
-        # Jitted, so that it is traced once for each shape, and not anew by each transformation.
+        # Jitted, so that each shape is traced once, and not again by each transformation.
         self.function, self.static = jax.jit(function, static_argnums=tuple(range(static))), static
         self._values = functools.lru_cache(maxsize=256)(self._values_of)
         self.rule: Callable[..., tuple[T, T]] | None = None
         self.primitive = Primitive(function.__name__.strip("_"))
         self.primitive.multiple_results = True
-        self.primitive.def_impl(lambda *leaves, **how: self._values(**how)(*leaves))
+        self.primitive.def_impl(lambda *leaves, **parameters: self._values(**parameters)(*leaves))
         self.primitive.def_abstract_eval(self._shapes)
         mlir.register_lowering(
             self.primitive,
-            mlir.lower_fun(lambda *leaves, **how: self._values(**how)(*leaves), multiple_results=True),
+            mlir.lower_fun(lambda *leaves, **parameters: self._values(**parameters)(*leaves), multiple_results=True),
         )
         ad.primitive_jvps[self.primitive] = self._differentiated
         batching.primitive_batchers[self.primitive] = self._batched
 
     def defjvp(self, rule: Callable[..., tuple[T, T]]) -> Callable[..., tuple[T, T]]:
-        """Set the rule: of the static arguments, a tuple of the others and a tuple of their tangents, to the value and
-        its tangent. Tangents of whole numbers and booleans are of dtype `float0`."""
+        """Set the rule `(*static, primals, tangents) -> (value, tangent of the value)`.
+
+        `primals` and `tangents` are tuples with an entry for each array argument. Tangents of whole numbers and
+        booleans are of dtype `float0`.
+        """
         self.rule = rule
         return rule
 
@@ -65,7 +68,7 @@ class custom_derivative(Generic[T]):
         return jax.tree.unflatten(shape, found)
 
     def _values_of(self, static: tuple[Any, ...], tree: Any, axes: Axes) -> Callable[..., list[jax.Array]]:
-        """The function from leaves to leaves, mapped over each of the batch `axes`, jitted."""
+        """The function as a jitted one from leaves to leaves, mapped over each level of `axes`."""
 
         @usual_rules
         def flat(*leaves: jax.Array) -> list[jax.Array]:
@@ -73,8 +76,8 @@ class custom_derivative(Generic[T]):
 
         return jax.jit(_mapped(flat, axes))
 
-    def _shapes(self, *avals: Any, **how: Any) -> list[Any]:
-        return jax.make_jaxpr(self._values(**how))(*avals).out_avals
+    def _shapes(self, *avals: Any, **parameters: Any) -> list[Any]:
+        return jax.make_jaxpr(self._values(**parameters))(*avals).out_avals
 
     def _differentiated(
         self, primals: Sequence[Any], tangents: Sequence[Any], static: tuple[Any, ...], tree: Any, axes: Axes
@@ -84,12 +87,12 @@ class custom_derivative(Generic[T]):
 
         @usual_rules
         def both(*leaves: jax.Array) -> list[jax.Array]:
-            values, moved = leaves[:count], [_still(leaf) for leaf in leaves[:count]]
+            values, changes = leaves[:count], [_zero_tangent(leaf) for leaf in leaves[:count]]
             for k, tangent in zip(moving, leaves[count:], strict=True):
-                moved[k] = tangent
+                changes[k] = tangent
             unflatten = functools.partial(jax.tree.unflatten, tree)
             assert self.rule is not None
-            value, change = self.rule(*static, unflatten(values), unflatten(moved))
+            value, change = self.rule(*static, unflatten(values), unflatten(changes))
             return [*jax.tree.leaves(value), *jax.tree.leaves(change)]
 
         along = tuple((*level, *(level[k] for k in moving)) for level in axes)
@@ -105,14 +108,15 @@ class custom_derivative(Generic[T]):
 
 
 def _mapped(function: Callable[..., T], axes: Axes) -> Callable[..., T]:
-    """A function of leaves, mapped by `jax.vmap` once for each level of batch axes, the first of them innermost."""
+    """A function of leaves, mapped by `jax.vmap` once for each level of `axes`, the first level innermost."""
     for level in axes:
         function = jax.vmap(function, in_axes=level)
     return function
 
 
-def _still(leaf: Any) -> Any:
-    """The tangent of what does not move. A constant inside a traced function may come as a Python number."""
+def _zero_tangent(leaf: Any) -> Any:
+    """The zero tangent of a leaf."""
+    # A constant inside a traced function may come as a Python number.
     leaf = jnp.asarray(leaf)
     floating = jnp.issubdtype(leaf.dtype, jnp.inexact)
     return jnp.zeros_like(leaf) if floating else np.zeros(leaf.shape, jax.dtypes.float0)

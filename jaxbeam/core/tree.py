@@ -3,14 +3,14 @@
 A field is one of three kinds:
 
 - data (the default): a leaf or a subtree that JAX traces and differentiates;
-- `index_field()`: an integer or boolean array. While it is a NumPy array it belongs to the *structure*
-  of the tree, compared by content, so `jax.grad` and `jax.vmap` of a scene meet only floats and scenes
-  on one mesh stack without copies of its topology. `unlock` turns index arrays into leaves: the solver
-  does so at its own jit boundary, where a new topology of the same shape must not compile again;
+- `index_field()`: an integer or boolean array. While it is a NumPy array it belongs to the *structure* of the tree and
+  is compared by content. So `jax.grad` and `jax.vmap` of a scene see only floats, and scenes on one mesh stack without
+  copies of its topology. `unlock` turns index arrays into leaves. The solver does this at its own jit boundary, where
+  a new topology of the same shape must not compile again;
 - `static_field()`: a hashable value, such as a function.
 
-`jax.tree_util.register_dataclass` rebuilds objects through their constructor, which then sees tracers and
-placeholders. Here unflattening bypasses it, so a constructor can validate what a person passes.
+`jax.tree_util.register_dataclass` rebuilds objects through their constructor, which then receives tracers and
+placeholders. Here unflattening bypasses the constructor, so a constructor can validate what a person passes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 T = TypeVar("T")
-
 
 # What users may pass for an array: JAX or NumPy arrays, numbers, or (nested) lists of numbers.
 Numbers: TypeAlias = ArrayLike | Sequence[Any]
@@ -53,7 +52,7 @@ class Key:
         self._device: jax.Array | None = None
 
     def on_device(self) -> Any:
-        """The array as one of JAX's, made once."""
+        """The array as a JAX array, made once and kept."""
         if self._device is not None:
             return self._device
         array = to_device(self.array)
@@ -77,7 +76,7 @@ class Key:
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(index_field, static_field))
 def pytree(cls: type[T]) -> type[T]:
-    """Make a class a frozen dataclass and a pytree node by the rules of this module."""
+    """Decorator: make a class a frozen dataclass and a pytree node, by the rules at the head of this module."""
     dataclasses.dataclass(frozen=True, eq=False)(cls)
     names: dict[str, list[str]] = {"data": [], "index": [], "static": []}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
@@ -88,7 +87,7 @@ def pytree(cls: type[T]) -> type[T]:
         keys: list[Key | None] = []
         for name in names["index"]:
             value = getattr(self, name)
-            # JAX's tangents of whole numbers are NumPy arrays too, of kind V: they are leaves.
+            # Tangents of whole numbers (dtype `float0`, kind V) are NumPy arrays too, but they are leaves.
             if isinstance(value, np.ndarray) and value.dtype.kind != "V":
                 keys.append(key_of(self, name))
             else:
@@ -120,7 +119,7 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def key_of(owner: Any, name: str) -> Key:
-    """The key of an index array, which is hashed once: a scene is commanded and solved again and again."""
+    """The key of an index array. It is hashed once and kept, because a scene is commanded and solved many times."""
     keys, array = _keys(owner), getattr(owner, name)
     if name not in keys or keys[name].array is not array:
         keys[name] = Key(array)
@@ -128,12 +127,12 @@ def key_of(owner: Any, name: str) -> Key:
 
 
 def _keys(owner: Any) -> dict[str, Key]:
-    """Keys of an owner's index arrays, as far as they were asked for; `replace` hands them on to its copies."""
+    """Keys of an owner's index arrays that were made so far. `replace` shares this dictionary with its copies."""
     return owner.__dict__.setdefault("_keys", {})
 
 
 def unlock(tree: T) -> T:
-    """The same tree with every index array a leaf, so that a jitted function is traced once per shape."""
+    """The same tree with its index arrays as leaves, so that a jitted function is traced once per shape."""
     if isinstance(tree, tuple | list):
         items = [unlock(item) for item in tree]
         return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
@@ -159,38 +158,40 @@ def replace(tree: T, **changes: Any) -> T:
 
 
 def holds_arrays(tree: Any, one: Any) -> bool:
-    """Whether all leaves, and `one` that must be there, are arrays. JAX makes trees of the same structure of anything,
-    and these must print too."""
+    """Whether all leaves of `tree` are arrays, and `one`, a field that could also be `None`, is one too.
+
+    JAX builds trees of the same structure with any values as leaves, and `repr` must work for these too.
+    """
     return all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(tree), one])
 
 
 def is_concrete(*values: Any) -> bool:
-    """True if no value is a tracer, so that checks on numbers can run on the host."""
+    """Whether no value is a tracer, so that checks on numbers can run on the host."""
     return not any(isinstance(value, Tracer) for value in values)
 
 
 def namespace(*values: Any) -> Any:
-    """NumPy if no value is a tracer, else `jax.numpy`: a scene of plain numbers is built without compiling anything."""
+    """NumPy if no value is a tracer, else `jax.numpy`. So a scene of plain numbers is built without compiling."""
     return np if is_concrete(*values) else jnp
 
 
 def to_device(values: Any, dtype: Any = None) -> Any:
-    """A JAX array of plain numbers, or a JAX array itself, in JAX's dtype for them unless one is given.
+    """Plain numbers or a JAX array as a JAX array of `dtype`, by default of JAX's own dtype for them.
 
     `jnp.asarray` would compile a program for each shape it meets.
     """
     if isinstance(values, jax.Array):
         return values if dtype in (None, values.dtype) else values.astype(dtype)
-    # Inside jit too these are constants, on which checks can run.
+    # Inside jit, too, the result is a concrete array, on which checks can run.
     host = np.asarray(values, dtype)
     with jax.ensure_compile_time_eval():
         array = jax.device_put(host)
-    # In shard_map outside jit it is traced even so, and nothing traced may be kept for later calls.
+    # In shard_map outside jit the result is traced even so. A tracer must not be kept for later calls: return NumPy.
     return array if is_concrete(array) else host
 
 
 def read_only(values: Any, dtype: Any = None) -> np.ndarray:
-    """A read-only NumPy copy, fit to be structure."""
+    """A read-only NumPy copy, for an index field."""
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array

@@ -1,1 +1,1 @@
-"""Linear algebra of Newton's method. It knows the topology of a scene, and nothing of its physics."""
+"""Linear algebra of Newton's method. It uses the topology of a scene, not its physics."""

@@ -1,8 +1,8 @@
-"""The order of unknowns for `BlockTridiagonal`: a chain of blocks, of which only neighbours are coupled.
+"""The order of unknowns for `BlockTridiagonal`: a chain of blocks in which each is coupled to its neighbours only.
 
 Breadth-first levels of nodes from the clamp make the Hessian of any mesh block tridiagonal (the level structure of
-Cuthill and McKee, 1969). Narrow levels are joined. Unknowns that couple far blocks, such as the free ends of a long
-tendon, are moved to a border of a few columns. Plain NumPy, once for a topology.
+Cuthill and McKee, 1969). Narrow levels are joined into one block. Unknowns that couple distant blocks, such as the free
+ends of a long tendon, are moved to a border of a few columns. Plain NumPy, run once for each topology.
 """
 
 from __future__ import annotations
@@ -16,39 +16,53 @@ from jaxbeam.core.tree import Key
 
 
 class Topology(NamedTuple):
-    """What a layout depends on, hashable: elements, fixed coordinates and the nodes of every term."""
+    """What a layout depends on. Hashable.
+
+    elements: `(t, k)`, nodes of each element.
+    fixed: `(n, d)` booleans, true for coordinates that are held.
+    stencils: for each term, `(m, k)`, nodes of each stencil.
+    """
 
     elements: Key
     fixed: Key
     stencils: tuple[Key, ...]
 
 
-# Parts of a block, in the order of its unknowns: coupled to the block before, to none, to both, to the one after.
+# Blocks that a node is coupled to: the one before, neither, both, the one after. Unknowns of a block are in this order.
 BEFORE, NEITHER, BOTH, AFTER = range(4)
 
 
 class Chain(NamedTuple):
-    """Unknowns in a chain of blocks, of which only neighbours are coupled, but for those on the border; the fields are
-    those of `Layout`, `shape` its `blocks`."""
+    """A chain of blocks and its border.
+
+    slots: `(N,)`, flat coordinate of each unknown, as in `Layout`.
+    shape: `(b, w, head, tail, r)`, as `blocks` in `Layout`.
+    """
 
     slots: np.ndarray
     shape: tuple[int, int, int, int, int]
 
 
-# What a block costs whatever its width, in multiplications: calls of LAPACK and the steps of a loop. Measured.
+# Cost of a block that does not depend on its width, in multiplications: LAPACK calls and loop steps. Measured.
 PER_BLOCK = 40_000
 
 
 def coupled(shape: tuple[int, int, int, int, int]) -> tuple[int, int]:
-    """How many of the last rows of a block are coupled to anything after it, and to how many columns: the first ones of
-    the next block and the border's."""
+    """Rows and columns `(tall, wide)` of the coupling of a block to what is eliminated after it.
+
+    The rows are the last `tail` of the block, or all `w` if there is a border. The columns are the first `head` of the
+    next block and the `r` of the border.
+    """
     _, w, head, tail, r = shape
     return (w if r else tail), head + r
 
 
 def multiplications(shape: tuple[int, int, int, int, int]) -> float:
-    """What a factorisation by blocks of this shape (`Layout.blocks`) takes: a Cholesky of each block, a triangular
-    solve and a product for what it is coupled to."""
+    """Multiplications of a factorisation with blocks of this shape (`Layout.blocks`).
+
+    They are a Cholesky factorisation of each block, a triangular solve and a product for its coupling, and a Cholesky
+    factorisation of the border.
+    """
     b, w, _, _, r = shape
     tall, wide = coupled(shape)
     return b * (w**3 / 6 + tall**2 * wide / 2 + tall * wide**2) + r**3 / 6
@@ -56,7 +70,12 @@ def multiplications(shape: tuple[int, int, int, int, int]) -> float:
 
 @lru_cache(maxsize=32)
 def chain_of(topology: Topology, joined: int) -> Chain:
-    """The chain of blocks that costs least: breadth-first levels from one of a few roots, joined to several a block."""
+    """The cheapest of several chains, made of breadth-first levels from a few roots.
+
+    Args:
+        topology: elements, fixed coordinates and stencils.
+        joined: several levels may make a block of up to this many unknowns.
+    """
     weight = (~topology.fixed.array).sum(axis=1)
     best = min(
         _level_structures(topology), key=lambda level: (level.max() + 1.0) * np.bincount(level, weight).max() ** 3
@@ -64,13 +83,17 @@ def chain_of(topology: Topology, joined: int) -> Chain:
     widest = int(np.bincount(best, weight).max())
     limits = {widest, *range(2 * widest, joined + 1, widest)}
     blocks = [_joined(best, weight, limit) for limit in limits]
-    # Either way round: what couples two blocks may be few unknowns of the one and all of the other.
+    # Try both directions: two blocks may be coupled through few unknowns of one and all unknowns of the other.
     chains = [_chain(topology, each) for block in blocks for each in (block, block.max() - block)]
     return min(chains, key=lambda chain: multiplications(chain.shape) + PER_BLOCK * chain.shape[0])
 
 
 def _level_structures(topology: Topology) -> list[np.ndarray]:
-    """Breadth-first level of each node, from a few roots."""
+    """Breadth-first level of each node, for several roots.
+
+    The roots are all held nodes; each of the first four connected groups of held nodes, if there are several; one node
+    at an end of the mesh; and all nodes at that end.
+    """
     fixed = topology.fixed.array
     neighbours = _adjacency(fixed.shape[0], topology.elements.array)
     roots: list[np.ndarray] = []
@@ -85,7 +108,7 @@ def _level_structures(topology: Topology) -> list[np.ndarray]:
 
 
 def _joined(level: np.ndarray, weight: np.ndarray, limit: float) -> np.ndarray:
-    """Block of each node: neighbouring levels joined while they fit the limit."""
+    """Block of each node. Consecutive levels share a block while their weights add up to at most `limit`."""
     widths = np.bincount(level, weight)
     block, filled = np.zeros(len(widths), int), 0.0
     for k, width in enumerate(widths):
@@ -96,12 +119,12 @@ def _joined(level: np.ndarray, weight: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _chain(topology: Topology, block: np.ndarray) -> Chain:
-    """The chain of these blocks: what has to go to the border, and what of a block is coupled to its neighbours."""
+    """The chain for the given block of each node: chooses the border and orders the unknowns of each block."""
     free = np.logical_not(topology.fixed.array)
     inner: np.ndarray = free.any(axis=1)
     border = _border(topology, block)
     inner[border] = False
-    # Blocks without an unknown are none.
+    # Number the blocks anew, without those that hold no unknown.
     _, numbered = np.unique(block[inner], return_inverse=True)
     block = np.full(inner.size, -1)
     block[inner] = numbered
@@ -110,9 +133,9 @@ def _chain(topology: Topology, block: np.ndarray) -> Chain:
         nodes, there = stencil.array, inner[stencil.array]
         low = np.where(there, block[nodes], inner.size).min(axis=1, keepdims=True)
         high = block[nodes].max(axis=1, keepdims=True)
-        coupled = there & (high > low)
-        after[nodes[coupled & (block[nodes] == low)]] = True
-        before[nodes[coupled & (block[nodes] == high)]] = True
+        spanning = there & (high > low)
+        after[nodes[spanning & (block[nodes] == low)]] = True
+        before[nodes[spanning & (block[nodes] == high)]] = True
     part = np.where(before, np.where(after, BOTH, BEFORE), np.where(after, AFTER, NEITHER))
 
     unknown, outer = (free & inner[:, None]).ravel(), np.zeros_like(free)
@@ -124,7 +147,7 @@ def _chain(topology: Topology, block: np.ndarray) -> Chain:
     b = int(owner.max(initial=0)) + 1
     amount = np.bincount(owner, minlength=b)
     w = max(int(amount.max()), 1)
-    # Padding comes before those that are coupled to the next block.
+    # Padding is placed before the unknowns that are coupled to the next block: these are the last rows of their block.
     within = np.arange(used.size) - np.repeat(np.cumsum(amount) - amount, amount)
     within = np.where(part >= BOTH, within + w - amount[owner], within)
     head = int(within[(part == BEFORE) | (part == BOTH)].max(initial=-1)) + 1
@@ -137,7 +160,7 @@ def _chain(topology: Topology, block: np.ndarray) -> Chain:
 
 
 def _adjacency(count: int, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours of each node in compressed rows: `(start, neighbour)`."""
+    """Neighbours `neighbour[start[i] : start[i + 1]]` of each node `i`, as compressed rows `(start, neighbour)`."""
     k = elements.shape[1]
     i, j = np.nonzero(~np.eye(k, dtype=bool))
     pairs = np.unique(elements[:, i].ravel().astype(np.int64) * count + elements[:, j].ravel())
@@ -145,7 +168,7 @@ def _adjacency(count: int, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def breadth_first_levels(root: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Breadth-first level of each node; a further piece of the mesh continues the count."""
+    """Breadth-first level of each node. Levels of a disconnected piece of the mesh continue the count."""
     start, neighbour = neighbours
     level = np.full(start.size - 1, -1)
     front, depth, seen = np.asarray(root), 0, 0
@@ -165,7 +188,7 @@ def breadth_first_levels(root: np.ndarray, neighbours: tuple[np.ndarray, np.ndar
 
 
 def _components(nodes: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
-    """The connected groups of a subset of the nodes."""
+    """Connected groups of a subset of the nodes."""
     start, neighbour = neighbours
     left, groups = set(nodes.tolist()), []
     while left:
@@ -182,7 +205,7 @@ def _components(nodes: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray]) ->
 
 
 def _border(topology: Topology, block: np.ndarray) -> np.ndarray:
-    """Nodes to eliminate last, so that every stencil keeps to two neighbouring blocks."""
+    """Nodes of the border. The other free nodes of each stencil lie in one block or in two neighbouring ones."""
     free = np.logical_not(topology.fixed.array.all(axis=1))
     border: set[int] = set()
     for stencil in topology.stencils:

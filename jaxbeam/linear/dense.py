@@ -13,12 +13,10 @@ from jax import lax
 from jaxbeam.linear.blocks import Topology
 from jaxbeam.linear.layout import Layout, _inverse, _layout, _mirrored
 
-# ---------------------------------------------------------------------------------------------- dense
-
 
 @dataclasses.dataclass(frozen=True)
 class Dense:
-    """Dense Cholesky: for tests and tiny scenes. Time grows with the cube of the unknowns."""
+    """Dense Cholesky: for tests and tiny scenes. Time grows with the cube of the number of unknowns."""
 
     def layout(self, topology: Topology) -> Layout:
         return _dense_layout(topology)

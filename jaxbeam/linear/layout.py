@@ -1,7 +1,7 @@
 """What linear solvers share: the layout of a matrix, its assembly, and vectors of unknowns.
 
-A linear solver is a value with the methods of `LinearSolver`. Solvers share the assembly and differ in where an entry
-of the matrix is stored.
+A linear solver is an object with the methods of `LinearSolver`. All solvers use the same assembly. They differ in where
+they store an entry of the matrix.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from jaxbeam.linear.blocks import Topology
 class Layout:
     """Where unknowns and matrix entries are stored, for one topology.
 
-    slots `(N,)`: flat coordinate (node * d + axis) of each unknown; the value `n d` marks padding.
-    position `(n d,)`: unknown of each flat coordinate; the value `N` marks a fixed one.
-    scatter: for each term, `(s (s + 1) / 2, m)` places in the storage of the lower triangles of its stencil Hessians,
-        `s = k d`, row by row; entries that are fixed point past the end and are dropped.
-    diagonal `(N,)`: places of the diagonal.
-    empty `(size,)`: storage before assembly, as booleans: true on the diagonal of the padding.
-    blocks: number of blocks, their width, how many rows and columns couple neighbours, and the width of the border.
+    The storage is a flat array of `size` numbers with the lower triangle of the matrix. A place is an index into it.
+
+    slots: `(N,)`, flat coordinate (node * d + axis) of each unknown; the value `n d` marks padding.
+    position: `(n d,)`, unknown of each flat coordinate; the value `N` marks a fixed one.
+    scatter: for each term, `(s (s + 1) / 2, m)`, places of the lower triangles of its stencil Hessians, row by row,
+        where `s = k d`; entries of fixed coordinates have a place past the end, and assembly drops them.
+    diagonal: `(N,)`, places of the diagonal.
+    empty: `(size,)`, storage before assembly, as booleans: true on the diagonal of the padding.
+    blocks: `(b, w, head, tail, r)`: `b` blocks of `w` unknowns, and `r` unknowns in the border. Of each block only the
+        first `head` unknowns are coupled to the block before, and only the last `tail` to the block after.
     """
 
     slots: jax.Array
@@ -40,37 +43,41 @@ class Layout:
 
 
 class LinearSolver(Protocol):
-    """What `Newton` asks of a linear solver."""
+    """The methods that `Newton` calls."""
 
     def __hash__(self) -> int: ...
 
-    def layout(self, topology: Topology) -> Layout: ...
+    def layout(self, topology: Topology) -> Layout:
+        """Where unknowns and matrix entries are stored."""
+        ...
 
     def factor(self, layout: Layout, storage: jax.Array) -> tuple[Any, jax.Array]:
-        """Factor, and whether the matrix is positive definite to working precision."""
+        """Cholesky factor, and `()` whether the matrix is positive definite to working precision."""
         ...
 
     def pivots(self, layout: Layout, factor: Any) -> jax.Array:
-        """What was left of each diagonal entry `(N,)` when its turn came to be eliminated."""
+        """Pivots `(N,)`: squares of the diagonal of the Cholesky factor."""
         ...
 
     def solve(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array:
-        """Solution for `rhs` `(N,)`, or for each column of one `(N, k)`."""
+        """Solution for one right-hand side `(N,)`, or for each column of `(N, k)`. `factor` is from `factor`."""
         ...
 
     def factor_indefinite(self, layout: Layout, storage: jax.Array) -> tuple[Any, jax.Array]:
-        """Factor of a matrix of any inertia, and how many of its eigenvalues are negative."""
+        """Factor of a matrix of any inertia, and `()` the number of its negative eigenvalues."""
         ...
 
-    def solve_indefinite(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array: ...
+    def solve_indefinite(self, layout: Layout, factor: Any, rhs: jax.Array) -> jax.Array:
+        """Solution for one right-hand side `(N,)`. `factor` is from `factor_indefinite`."""
+        ...
 
 
 def assemble(layout: Layout, hessians: list[jax.Array]) -> jax.Array:
     """Storage of the sum of stencil Hessians `(k d, k d, m)`, one array for each term."""
     storage = layout.empty.astype(hessians[0].dtype)
     for places, hessian in zip(layout.scatter, hessians, strict=True):
-        # In a few parts, so that XLA computes the Hessians before the loop: fused with what reads them, each entry
-        # would be computed by itself.
+        # A loop over a few parts makes XLA compute the Hessians before it. Without a loop XLA fuses them with the
+        # scatter and computes each entry separately.
         parts = next(n for n in (3, 2, 1) if len(places) % n == 0)
         rows, columns = (jnp.asarray(i.reshape(parts, -1)) for i in np.tril_indices(len(hessian)))
         add = lambda all, part, h=hessian: (all.at[part[0]].add(h[part[1], part[2]], mode="drop"), None)
@@ -89,25 +96,27 @@ def expand(layout: Layout, unknowns: jax.Array, shape: tuple[int, ...]) -> jax.A
 
 
 def _mirrored(matrix: jax.Array) -> jax.Array:
-    """A symmetric matrix of which the lower triangle is stored."""
+    """The full symmetric matrix of a lower triangle."""
     return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 
 
 def _inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Inverse of a symmetric matrix, and how many of its eigenvalues are negative."""
+    """Inverse of a symmetric matrix, and the number of its negative eigenvalues."""
     values, vectors = jnp.linalg.eigh(matrix)
     return (vectors / values) @ vectors.T, jnp.sum(values < 0, dtype=jnp.int32)
 
 
 def _coordinates(stencil: np.ndarray, topology: Topology) -> np.ndarray:
-    """Flat coordinates `(m, k d)` of the nodes `(m, k)` of stencils."""
+    """Flat coordinates `(m, k d)` of stencils with nodes `(m, k)`."""
     d = topology.fixed.array.shape[1]
     return (stencil.astype(np.int64)[..., None] * d + np.arange(d)).reshape(len(stencil), -1)
 
 
 def _stencil_pairs(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column `(m, s (s + 1) / 2)` in the lower triangle of the matrix of each entry in the lower triangle of
-    stencil Hessians, from their unknowns `(m, s)`."""
+    """Rows and columns `(m, s (s + 1) / 2)` in the matrix, for the lower triangles of stencil Hessians.
+
+    `unknowns` `(m, s)` are those of each stencil. All results lie in the lower triangle of the matrix.
+    """
     i, j = np.tril_indices(unknowns.shape[1])
     a, b = unknowns[:, i], unknowns[:, j]
     return np.maximum(a, b), np.minimum(a, b)
@@ -122,7 +131,7 @@ def _layout(
     blocks: tuple[int, int, int, int, int],
     place: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> Layout:
-    """The layout of a storage of `total` numbers, in which row `p` and column `q <= p` have this `place`."""
+    """The layout of a storage of `total` numbers, where `place(p, q)` is the place of row `p` and column `q <= p`."""
     if total >= 2**31 - 1:
         raise ValueError(
             f"mesh: its factor would hold {total} numbers, more than 32-bit indices address; use a coarser mesh"

@@ -1,4 +1,4 @@
-"""Pictures and animations of beams. The only room that needs matplotlib: import it by name.
+"""Pictures and animations of beams. Only this folder needs matplotlib, so it must be imported by name.
 
 Every function draws into the `ax` it is given or into a new `Figure`, and leaves pyplot, its backend and `rcParams`
 alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an animation with

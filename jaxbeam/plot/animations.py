@@ -19,7 +19,7 @@ from jaxbeam.plot.stills import curves
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene
 
-# Frames for which an animation rests on its last state.
+# Number of frames for which an animation shows its last state.
 HOLD = 6
 
 
@@ -34,9 +34,9 @@ def animate_ramp(
     """A beam in motion, and beside it the curve that it traces.
 
     Args:
-        states: such as a ramp.
+        states: the states to show in order, such as a ramp.
         measure: as in `curves`.
-        label: of the curve's vertical axis: quantity and unit.
+        label: text of the curve's vertical axis: quantity and unit.
     """
     figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -79,10 +79,10 @@ def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dp
     """Write an animation as `.gif`, which needs no other program, or as `.mp4`, which needs ffmpeg.
 
     Args:
-        animation: of `animate_ramp` or `animate_beams`.
-        path: where to; its ending decides the format.
-        fps: frames a second.
-        dpi: pixels an inch.
+        animation: from `animate_ramp` or `animate_beams`.
+        path: of the file; its ending decides the format.
+        fps: frames per second.
+        dpi: pixels per inch.
 
     Raises:
         ValueError: if the ending is another one, or ffmpeg is needed and not installed.
@@ -103,7 +103,7 @@ def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dp
 def _play(
     figure: Figure, axes: Sequence[Axes], states: Sequence[States], trace: Callable[[int], None] = lambda frame: None
 ) -> FuncAnimation:
-    """Animate each of `states` on its axes; `trace` draws what else changes."""
+    """Animate each of `states` on its axes; `trace(frame)` draws whatever else changes from frame to frame."""
     beams = [_Beam(ax, each.scene) for ax, each in zip(axes, states, strict=True)]
     pushing = [each.measure(_pushing) for each in states]
     _legend(figure, [each.scene for each in states], pushing)
@@ -114,11 +114,12 @@ def _play(
             ax.set_title("\n".join(filter(None, [each.title, _ratios(each.commands[frame])])), fontsize="medium")
         trace(frame)
 
-    # Laid out once: a layout of its own for every frame would be slow, and the panels would jitter.
+    # Lay out the panels once: a new layout for every frame would be slow, and the panels would jitter.
     draw(0)
     _fit(figure, axes[:1])
     figure.draw_without_rendering()
-    # None, not "none": for a placeholder each frame would be drawn twice. It stands for what the settings say.
+    # Give None, not "none": that sets a placeholder, with which each frame is drawn twice. None stands for the engine
+    # that `rcParams` ask for, so they must ask for none here.
     with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
     last = len(states[0]) - 1

@@ -31,33 +31,25 @@ from jaxbeam.scene.scene import Scene, placed
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
 
+# Colours and markers of tendons and curves.
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-
-
 MARKERS = ("o", "s", "^", "D", "v", "P")
-
-
+# Colours of the body, the edges of its elements, its outline, and its outline at rest.
 BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
-
-
+# Dashes of a tendon that pushes, and of the unstable part of a branch.
 PUSHING = (0, (2.2, 1.3))
-
-
 UNSTABLE = (0, (3.0, 1.8))
-
-
 # Width of a figure in inches: the text width of a paper.
 PAPER = 7.2
 
 
 def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
-    """Axis limits `((x0, x1), (y0, y1))` that hold all points of `positions`, arrays `(..., 2)` or `(..., 3)` of a rod.
+    """Axis limits `((x0, x1), (y0, y1))` that contain all points of `positions`.
 
-    Those that pictures choose by default hold, besides the nodes, what lies outside them: curved edges, and tendons
-    beside a rod.
+    The default limits of pictures also contain what lies outside the nodes: curved edges, and tendons beside a rod.
 
     Args:
-        positions: in the user's length unit.
+        positions: arrays `(..., 2)`, or `(..., 3)` for a rod, in the user's length unit.
         margin: added on each side, as a fraction of the larger extent.
 
     Raises:
@@ -75,7 +67,7 @@ def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
 
 
 class _Beam:
-    """The artists of one beam; `move` puts them where the nodes are."""
+    """The artists of one beam; `move` places them for given positions of the nodes."""
 
     def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
         self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
@@ -88,7 +80,7 @@ class _Beam:
         width = 2.6 if self.rod else 0.9
         self.outline = LineCollection([], colors=OUTLINE, linewidths=width, capstyle="round", zorder=3)
         colours = [tendon_colours[number % len(tendon_colours)] for number in range(len(self.names))]
-        # What tendons are held by, other than nodes: a patch of surface, or an arm of the rod.
+        # What holds a tendon that is not attached to a node: a patch of surface, or an arm of the rod.
         width = 0.9 if self.rod else 2.8
         self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
         for collection in (ghost, self.body, self.outline, self.held):
@@ -113,7 +105,10 @@ class _Beam:
 
 
 def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
-    """`(m,)`: which of the lines push. One at its commanded length, but for round-off, does neither."""
+    """Which of the lines push, `(m,)`.
+
+    Positions are enlarged by 1e-5, so that a line at its commanded length does not push by round-off.
+    """
     x, found = x.at[:, :2].multiply(1 + 1e-5), []
     for term, lines in drawn_terms(scene):
         tension = term.kind.measured(x[term.nodes], term.params).get("tension")
@@ -122,6 +117,7 @@ def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def _positions(scene: Scene, x: Numbers) -> np.ndarray:
+    """Node positions as a NumPy array, checked to be finite."""
     positions = np.asarray(placed(scene, x))
     if not np.isfinite(positions).all():
         raise ValueError("x: some positions are not finite and cannot be drawn; see check(solution)")
@@ -145,13 +141,17 @@ def _draw_clamp(ax: Axes, scene: Scene, edges: np.ndarray) -> None:
 
 
 def _prepare(ax: Axes, bounds: Limits) -> Axes:
+    """Set limits, labels and equal scales of axes for a beam."""
     ax.set(xlim=bounds[0], ylim=bounds[1], xlabel="x (length units)", ylabel="y (length units)")
     ax.set_aspect("equal")
     return ax
 
 
 def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
-    """A figure with a row of panels for each of `rows`, the limits of its panels; only the outer ones are labelled."""
+    """A figure of panels in `columns` columns and a row for each of `rows`, the limits of the panels in that row.
+
+    Only the outer panels have labels.
+    """
     heights = [y1 - y0 for _, (y0, y1) in rows]
     # The padding keeps the last tick label of one panel apart from the first of the next.
     figure = Figure(figsize=(PAPER, PAPER), layout=ConstrainedLayoutEngine(w_pad=0.08))
@@ -167,10 +167,15 @@ def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
 
 
 def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
-    """Make the figure as high as `axes`, one panel of each row, need, so that none floats in empty space."""
+    """Set the height of the figure to what its panels need, so that none floats in empty space.
+
+    Args:
+        figure: to set.
+        axes: one panel of each row.
+    """
     for ax in axes:
         ax.set_aspect("auto")
-    for _ in range(2):  # tick labels depend on the height: the second pass measures them at nearly the last one
+    for _ in range(2):  # tick labels depend on the height: the second pass measures them at nearly the final height
         figure.draw_without_rendering()
         excess = 0.0
         for ax in axes:
@@ -183,7 +188,13 @@ def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
 
 
 def _legend(figure: Figure, scenes: Sequence[Scene], pushing: Sequence[np.ndarray]) -> None:
-    """One legend below all panels; `pushing`, of each beam, is `(..., m)`: whether a line ever pushes."""
+    """One legend below all panels.
+
+    Args:
+        figure: of the panels.
+        scenes: of the beams.
+        pushing: for each beam, `(..., m)` booleans from `_pushing`, of one state or of several.
+    """
     names = max((line_names(scene) for scene in scenes), key=len)
     handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=name) for k, name in enumerate(names)]
     if any(each.any() for each in pushing):
@@ -193,4 +204,5 @@ def _legend(figure: Figure, scenes: Sequence[Scene], pushing: Sequence[np.ndarra
 
 
 def _ratios(ratios: np.ndarray) -> str:
+    """A title that states the commands `(m,)`."""
     return "ratios " + ", ".join(f"{ratio:.2f}" for ratio in ratios)

@@ -19,7 +19,7 @@ class States:
         scene: with `n` nodes and `m` commands.
         commands: `(s, m)`, such as ratios of tendons: `commands(ratios, steps)` for a ramp.
         x: `(s, n, 2)` node positions: `Solution.x` of that ramp or sweep.
-        title: what to call them in pictures.
+        title: their name in pictures.
 
     Raises:
         ValueError: if a shape is wrong, there is no state, or a position is not finite.
@@ -47,5 +47,5 @@ class States:
 
     @property
     def actuation(self) -> np.ndarray:
-        """`(s,)` ratio of the tendon whose command varies most; of the first of those that vary alike."""
+        """`(s,)` ratio of the tendon whose command varies most; the first one if several vary alike."""
         return self.commands[:, np.argmax(np.ptp(self.commands, axis=0).round(6))]

@@ -1,12 +1,6 @@
-"""Pictures and animations of beams. The only file that needs matplotlib: import it by name.
+"""Still pictures: a beam, fields on it, curves of measures, branches of equilibria, and galleries of states.
 
-Every function draws into the `ax` it is given or into a new `Figure`, and leaves pyplot, its backend and
-`rcParams` alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an
-animation with `save_animation`. Lengths, forces and stresses are in the user's units.
-
-A tendon that pulls is drawn solid and one that pushes dashed; the patch of surface that an anchor of finite width pulls
-on is a heavier line in its colour. A rod, whose nodes are `(n, 3)`, is drawn as its centre line. Colours are those of
-Okabe and Ito (2008), which survive colour blindness; several curves also differ in their markers.
+`jaxbeam.plot` describes what all pictures have in common.
 """
 
 from __future__ import annotations
@@ -54,7 +48,7 @@ def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | N
     """The beam with its mesh, tendons, guides and anchors, clamp, and its outline at rest.
 
     Args:
-        scene: as commanded: its commands decide which tendons push.
+        scene: under the commands of this state, which decide which tendons push.
         x: `(n, 2)` node positions.
         ax: where to draw (`ax.legend()` names what is there); by default a new figure with a legend.
         bounds: axis limits, by default those that hold the beam here and at rest.
@@ -92,10 +86,11 @@ def field(
         scene: what the values were measured on.
         x: `(n, 2)` node positions.
         values: `(t,)`, one for each element of the solids, such as `jacobians(scene, x)`.
-        label: of the colour bar: quantity and unit.
-        centre: where diverging colours change hue; by default 0 if the values have both signs.
-        colours: values at the two ends of the colour bar. By default the 1st and 99th percentile, since the
-            peak beside a node that carries a point load is a matter of mesh; pointed ends tell of values beyond.
+        label: text of the colour bar: quantity and unit.
+        centre: value at which diverging colours change hue; by default 0 if the values have both signs.
+        colours: values at the two ends of the colour bar. By default they are the 1st and 99th percentile, because the
+            peak beside a node that carries a point load depends on the mesh. Pointed ends of the bar tell that there
+            are values beyond.
         ax: where to draw; by default a new figure.
         bounds: axis limits, by default those that hold the beam here and at rest.
 
@@ -142,9 +137,9 @@ def curves(
     """A measure against actuation: the ratio of the tendon whose command varies most, falling to the right.
 
     Args:
-        states: ramps or sweeps; each has a marker of its own, for every state.
+        states: ramps or sweeps; every state is marked, and each ramp or sweep has a marker of its own.
         measure: `(scene, x)` to a scalar, drawn once for each of `states`, or to `(m,)`, drawn for each tendon.
-        label: of the vertical axis: quantity and unit.
+        label: text of the vertical axis: quantity and unit.
         ax: where to draw; by default a new figure.
 
     Raises:
@@ -182,13 +177,15 @@ def branches(
     *,
     ax: Axes | None = None,
 ) -> Axes:
-    """A measure along branches of equilibria: stable full, unstable dashed, folds and bifurcations marked.
+    """A measure along branches of equilibria. Stable parts are full lines, unstable ones dashed.
+
+    Folds and bifurcations are marked.
 
     Args:
-        scene: that was traced.
-        traced: of `trace_branch`; each has a colour of its own.
+        scene: the scene that was traced.
+        traced: branches from `trace_branch`; each has a colour of its own.
         measure: `(scene, x)` to a scalar.
-        label: of the vertical axis: quantity and unit.
+        label: text of the vertical axis: quantity and unit.
         ax: where to draw; by default a new figure.
 
     Raises:
@@ -229,9 +226,9 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
     """A panel for each state, all to one scale.
 
     Args:
-        states: such as a sweep over asymmetric commands.
+        states: the states to show, such as a sweep over asymmetric commands.
         titles: one for each state; by default its ratios.
-        columns: panels in a row.
+        columns: number of panels in a row.
 
     Raises:
         ValueError: if the titles are not one for each state, or `columns` is less than 1.
@@ -260,7 +257,7 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
 
 
 def _name_actuation_axes(ax: Axes, label: str) -> None:
-    """Axes of a measure against actuation, which grows to the right as the ratio falls."""
+    """Label the axes of a measure against actuation, which grows to the right as the ratio falls."""
     ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
     if not ax.xaxis_inverted():
         ax.invert_xaxis()

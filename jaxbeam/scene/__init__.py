@@ -1,1 +1,1 @@
-"""A scene and what is measured on it; the reference scenes; what holds a body; overlap."""
+"""Scenes, the reference scenes, measures, and checks of supports and of overlap."""

@@ -1,4 +1,4 @@
-"""The reference scenes: the tendon beam of triangles and as a rod."""
+"""The reference scenes: the tendon beam made of triangles, and as a rod."""
 
 from __future__ import annotations
 
@@ -44,21 +44,22 @@ def tendon_beam(
     """The reference scene: a cantilever clamped at its left edge, with a tendon along half of each side.
 
     The first tendon joins the top-left and the top-middle node, the second the bottom-left and the
-    bottom-middle node. Both are at their natural length, half the beam's.
+    bottom-middle node. Both are at their natural length, which is half the length of the beam.
 
     Args:
-        nx: corners of triangles along the length, odd unless `graded`, so that a middle one exists.
-        ny: corners along the height.
+        nx: number of triangle corners along the length. It must be odd unless `graded`, so that one lies in the middle.
+        ny: number of corners along the height.
         length: of the beam, positive.
         height: of the beam, positive.
-        young: Young's modulus, scalar or one for each triangle.
+        young: Young's modulus, scalar or one for each triangle. Forces come out in its unit x length.
         poisson: Poisson's ratio, scalar or one for each triangle; `lame` turns both into Lame parameters.
         tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
-        order: 1 for triangles of three nodes, which lock as `poisson` nears 0.5, or 2 for six (see `rectangle`).
+        order: 1 for triangles of three nodes, which lock as `poisson` nears 0.5; 2 for six nodes (see `rectangle`).
         degree: of the quadrature, see `solid`.
-        anchor_width: of the patches that the free ends of the tendons pull on, see `tendons`. At 0 they pull on single
-            nodes, whose answer drifts as the mesh is refined: for a pull on the top to 0.8, six-node triangles give
-            9.77, 9.68, 9.46 degrees on 15 x 5, 29 x 7 and 57 x 13 corners, and 10.14 on each with a width of 0.25.
+        anchor_width: width of the surface patches that the unclamped ends of the tendons pull on, see `tendons`. At 0
+            they pull on single nodes, and the answer drifts as the mesh is refined: with the top tendon at ratio 0.8,
+            six-node triangles on 15 x 5, 29 x 7 and 57 x 13 corners give 9.77, 9.68 and 9.46 degrees. With a width of
+            0.25 they give 10.14 on each.
         graded: crowd nodes at the clamp, the faces and the middle, where the tendons end; see `rectangle`.
         diagonals: see `rectangle`.
         density: the material, see `jaxbeam.physics.materials`.
@@ -98,22 +99,23 @@ def rod_beam(
     """The reference scene as a rod (see `jaxbeam.physics.rod`): a cantilever with a tendon along half of each side.
 
     Args:
-        nodes: along the axis, odd, so that a middle one exists. Nine are within 0.5 % of the limit of many: at ratios
-            (0.8, 1.0) the tip turns by 10.31 degrees, in the limit by 10.35, by converged finite elements by 10.14.
+        nodes: number of nodes along the axis, odd, so that one lies in the middle. Nine are within 0.5 % of the limit
+            of many: at ratios (0.8, 1.0) nine give 10.31 degrees, the limit is 10.35, and converged finite elements
+            give 10.14.
         length: of the beam, positive.
         height: of the beam, positive.
-        young: Young's modulus, scalar or one for each element.
+        young: Young's modulus, scalar or one for each element. Forces come out in its unit x length.
         poisson: Poisson's ratio, scalar or one for each element; `lame` turns both into Lame parameters.
         tendon_modulus: scalar or `(2,)`; its unit depends on `stiffness`.
-        density: the material, see `jaxbeam.physics.materials`. As in `tendon_beam`, (1e4, 0.45) behaves as (9962,
-            0.4444) in the default, and as it says in `neo_hookean`. `linear_elastic` makes Simo's rod, linear in its
-            strains.
+        density: the material, see `jaxbeam.physics.materials`. In the default, as in `tendon_beam`, Young's modulus
+            1e4 and Poisson's ratio 0.45 behave as 9962 and 0.4444 at small strain; `neo_hookean` keeps 1e4 and 0.45.
+            `linear_elastic` makes Simo's rod, whose forces are linear in its strains.
         stiffness: the law of the tendons, see `tendons`.
         dtype: of everything computed; by default JAX's float.
 
     Returns:
-        A `Scene`, differentiable in every real argument. Positions `x` are `(n, 3)`; the third column is the height
-        times the angle of the section.
+        A `Scene`, differentiable in every real argument. Positions `x` are `(n, 3)`. The third column is the height
+        times the angle of the section in radians.
 
     Raises:
         ValueError: if `nodes` is even, or as `lame`, `rod` and `rod_tendons` do.

@@ -35,16 +35,17 @@ from jaxbeam.physics.energy import Term, check_nodes
 
 @pytree
 class Scene:
-    """What is simulated.
+    """What is simulated: a mesh, the energies on it, and the coordinates that are fixed.
 
     Args:
         mesh: the body at rest, with `n` nodes of `d` coordinates: 2, or 3 on a `Line` (see `jaxbeam.mesh.line`).
         terms: the energies that are summed; one that is absent is never traced.
-        fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`). It is
+        fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`). These coordinates are
             eliminated from the unknowns.
         tip: `(q,)` node numbers of the end section that the tip measures follow; may be empty.
 
-    Besides, `surface` `(e, 2)` or `(e, 3)` holds the edges of the surface of its solids (see `jaxbeam.mesh.surface`).
+    The attribute `surface`, `(e, 2)` or `(e, 3)`, is computed: edges of the surface of the solids, by node numbers (see
+    `jaxbeam.mesh.surface`).
 
     Raises:
         ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a term's node is out of range,
@@ -102,7 +103,7 @@ class Scene:
 
 
 def _check_dtype(number: int, term: Term, dtype: Any) -> None:
-    """Refuse parameters of more digits than the nodes have: energies would have another dtype than positions."""
+    """Refuse float parameters wider than the nodes' dtype: energies would have another dtype than positions."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(term.params):
         if leaf.dtype.kind == "f" and leaf.dtype.itemsize > dtype.itemsize:
             raise ValueError(
@@ -120,12 +121,13 @@ def _check_energy(number: int, term: Term, nodes: jax.Array) -> None:
 
 @lru_cache(maxsize=64)
 def _traced_once(name: str, energy: Callable[..., jax.Array], structure: Any, shapes: tuple[Any, ...]) -> None:
+    """Trace an energy to check that it returns a scalar; cached, so that each energy is traced once for its shapes."""
     x, *leaves = (jax.ShapeDtypeStruct(*each) for each in shapes)
     checks.scalar(name, "(x, params)", energy, x, jax.tree.unflatten(structure, leaves))
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse what is not a scene."""
+    """Refuse anything but a `Scene`, and a scene in float64 while `jax_enable_x64` is off."""
     checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
     dtype = scene.mesh.nodes.dtype
     if jax.dtypes.canonicalize_dtype(dtype) != dtype:
@@ -154,14 +156,15 @@ def clamped(mesh: Mesh, nodes: Numbers) -> np.ndarray:
 
 @usual_rules
 def command(scene: Scene, commands: Numbers) -> Scene:
-    """The scene under new commands, one for each stencil that is commanded, or for each term whose stencils share it.
+    """The scene under new commands: one for each commanded stencil, or one for all stencils of a term that share it.
 
     Args:
         scene: with `m` commands in all, in the order of its terms.
-        commands: `(m,)`; differentiable. That of a tendon is the ratio of its commanded to its natural length.
+        commands: `(m,)`; differentiable. The command of a tendon is the ratio of its commanded to its natural length.
 
     Raises:
-        ValueError: if the count is wrong or a concrete command is out of its range, as a ratio that is not positive.
+        ValueError: if the count is wrong or a concrete command is out of its range, such as a ratio that is not
+            positive.
     """
     check_scene(scene)
     values = checked_commands("ratios", scene, commands)
@@ -182,9 +185,9 @@ def checked_commands(name: str, scene: Scene, commands: Numbers) -> Any:
 
 
 def check_commands(name: str, scene: Scene, values: Any) -> None:
-    """Refuse concrete commands `(..., m)` that are out of the range of what they command.
+    """Refuse concrete commands `(..., m)` that are out of the range of the term that they command.
 
-    Traced ones are looked at by `is_valid`: commands are parameters.
+    Traced commands are checked by `is_valid`, like all parameters.
     """
     if not is_concrete(values):
         return
@@ -197,12 +200,12 @@ def check_commands(name: str, scene: Scene, values: Any) -> None:
 
 
 def commanded_terms(scene: Scene) -> list[Term]:
-    """The terms that are commanded, in order; their commands are numbered through."""
+    """The terms that take commands, in order. Commands are numbered consecutively over all of them."""
     return [term for term in scene.terms if term.kind.rest_command is not None]
 
 
 def command_count(scene: Scene) -> int:
-    """How many commands there are to give."""
+    """Number of commands `m` of a scene."""
     return sum(term.command_count for term in scene.terms)
 
 
@@ -213,13 +216,19 @@ def commands_of(scene: Scene) -> jax.Array:
 
 
 def rest_commands(scene: Scene) -> np.ndarray:
-    """The commands `(m,)` under which nothing acts: 1 for a tendon."""
+    """The commands `(m,)` at which the commanded terms do nothing: 1 for a tendon."""
     found = [np.full(term.command_count, term.kind.rest_command) for term in commanded_terms(scene)]
     return np.concatenate([*found, np.zeros(0)]).astype(scene.mesh.nodes.dtype)
 
 
 def command_units(scene: Scene, low: jax.Array, high: jax.Array) -> jax.Array:
-    """What changes of each command `(m,)` are measured in: 1 for ratios, else the width of its bounds `(m,)`."""
+    """Unit `(m,)` in which changes of each command are measured: 1 for ratios, else the width of its bounds.
+
+    Args:
+        scene: with `m` commands.
+        low: `(m,)` lower bounds.
+        high: `(m,)` upper bounds. Where they equal the lower ones, the unit is 1.
+    """
     units = [np.full(term.command_count, term.kind.command_unit, float) for term in commanded_terms(scene)]
     known = np.concatenate([*units, np.zeros(0)]).astype(low.dtype)
     width = lax.stop_gradient(high - low)
@@ -227,13 +236,13 @@ def command_units(scene: Scene, low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def partway(scene: Scene, share: jax.Array) -> Scene:
-    """The scene with only a share of its actuation and its loads."""
+    """The scene with a share `()` of its actuation and its loads: none at 0, all at 1."""
     terms = [replace(term, params=term.kind.partway(term.params, share)) for term in scene.terms]
     return replace(scene, terms=tuple(terms))
 
 
 def is_valid(scene: Scene) -> jax.Array:
-    """Whether every parameter `()` is in its range: what the builders check, for values that were traced."""
+    """Whether every parameter is in its range, `()`: the checks of the builders, for values that they saw traced."""
     valid = jnp.all(jnp.isfinite(scene.mesh.nodes))
     for term in scene.terms:
         for leaf in jax.tree.leaves(term.params):
@@ -246,14 +255,19 @@ def is_valid(scene: Scene) -> jax.Array:
 
 
 def extent(scene: Scene) -> jax.Array:
-    """The size of the body `()`: its largest extent at rest, wherever it lies."""
+    """The size of the body `()`: its largest extent at rest. It does not depend on where the body lies."""
     return jnp.max(jnp.ptp(scene.mesh.nodes, axis=0))
 
 
 class Evaluation(NamedTuple):
-    """Energy `()` and its gradient `(n, 2)`, each with the sum of the magnitudes that were added up in it.
+    """Energy and its gradient, each with a scale: the sum of the magnitudes of the numbers that were added up.
 
-    The second of each pair tells how large its round-off is, and what a relative residual is relative to.
+    The scales tell how large the round-off is. The relative residual is relative to the scale of the gradient.
+
+    energy: `()` energy of all terms.
+    energy_scale: `()` sum of the magnitudes of the stencil energies.
+    gradient: `(n, d)` derivative of the energy in the positions.
+    gradient_scale: `(n, d)` sum of the magnitudes of the stencil gradients at each coordinate.
     """
 
     energy: jax.Array
@@ -265,7 +279,7 @@ class Evaluation(NamedTuple):
 # Jitted, so that programs of the same scene share its trace.
 @jax.jit
 def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
-    """Energy and gradient at node positions `x` `(n, 2)`."""
+    """Energy and gradient at node positions `x` `(n, d)`."""
     energy = energy_scale = jnp.zeros((), x.dtype)
     both = jnp.zeros((*x.shape, 2), x.dtype)
     for term in scene.terms:
@@ -293,27 +307,31 @@ def forces(scene: Scene, x: jax.Array) -> jax.Array:
 def reactions(scene: Scene, x: jax.Array) -> jax.Array:
     """Force `(n, 2)` of the clamp on each node, zero for coordinates that are free.
 
-    At equilibrium the reactions balance every load from outside; the tendons, which push on the body
-    at both ends, are part of the body.
+    At equilibrium the reactions balance the external loads. Tendons are part of the body: they act on it at both ends,
+    so that their forces cancel in this balance.
     """
     return jnp.where(scene.fixed, -forces(scene, x), 0)
 
 
 def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[jax.Array]:
-    """For each term, the `(k d, k d, m)` Hessians of its stencils, by autodiff; or positive semidefinite ones."""
+    """For each term, the Hessians `(k d, k d, m)` of its stencils; with `convex`, positive semidefinite ones."""
     return [term.kind.hessians(x[term.nodes], term.params, convex) for term in scene.terms]
 
 
 @one_program
 def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
-    """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods; infinite if there are
-    neither. It is not only looked for at quadrature points."""
+    """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods, whichever is less.
+
+    It is the smallest over whole elements, not only over quadrature points. Infinite in a scene without either.
+    """
     return worst_element(scene, placed(scene, x))[0]
 
 
 def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The smallest `J` `()` anywhere in the solids, or stretch of a fibre of the rods, and the number `()` of its
-    element (-1 in a scene without either)."""
+    """What `smallest_jacobian` returns, `()`, and the number `()` of the element where it lies.
+
+    In a scene without solids and rods they are infinity and -1.
+    """
     found = [term.kind.margin(x[term.nodes], term.params) for term in scene.terms]
     margins = [each for each in found if each is not None]
     if not margins:
@@ -324,9 +342,9 @@ def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
-    """Largest `t` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
+    """Largest `t` `()` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
 
-    What an energy lets through zero it says itself (see `Energy.longest_step`).
+    Each energy gives its own limit, and may allow `J` to pass through zero (see `Energy.longest_step`).
     """
     limits = [jnp.asarray(jnp.inf, x.dtype)]
     for term in scene.terms:

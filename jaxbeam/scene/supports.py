@@ -1,9 +1,9 @@
-"""What must hold before a scene is solved: every piece of its mesh is held against rigid motion.
+"""The check before a solve that every piece of the mesh is held against rigid motion.
 
-Checked on the host, while everything is concrete. A scene that is not held can still be built, drawn and measured.
+It runs on the host and needs concrete values. A scene that is not held can still be built, drawn and measured.
 
-A rigid motion of a piece has three coordinates `q`: a translation, and a rotation about its centre times its size. What
-the terms other than the body resist it with is the second variation of their energy along the motion,
+The rigid motions of a piece have three coordinates `q`: two translations, and the angle of a rotation about the centre
+of the piece times its size. The terms other than the body resist these motions by the second variation of their energy,
 
     d2E/dq2 = J^T H J + sum g . d2x/dq2,     J = dx/dq,
 
@@ -24,17 +24,21 @@ from jaxbeam.mesh.mesh import pieces
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene
 
-# Round-off of a stencil's second variation, in eps of its dtype times the magnitudes that were added up in it. Measured
-# on tendons inside a body, with guides, patches and eccentricities, up to 1e5 from the origin: at most 0.5.
+# Bound of the round-off of a stencil's second variation, over eps of its dtype times the sum of the magnitudes added up
+# in it. Measured on tendons inside a body, with guides, patches and eccentricities, up to 1e5 from the origin: at most
+# 0.5.
 NOISE = 64
 
 
 class Rigid(NamedTuple):
-    """The rigid motions of the pieces of a mesh.
+    """The rigid motions of the `c` pieces of a mesh, three for each piece.
 
-    piece `(n,)`: of each node. centres `(c, 2)` and sizes `(c,)`: of each piece. slope `(n, d, 3 c)`: derivative of the
-    positions. bend `(n, d)`: their second derivative in the rotation of their piece. far `(n, d)`: its magnitude with
-    the round-off of positions far from the origin.
+    piece: `(n,)` number of the piece of each node.
+    centres: `(c, 2)` centre of each piece.
+    sizes: `(c,)` largest extent of each piece.
+    slope: `(n, d, 3 c)` derivative of the positions in the coordinates `q` of the motions.
+    bend: `(n, d)` second derivative of the positions in the rotation of their piece.
+    far: `(n, d)` scale of the round-off of `bend`, which grows with the distance from the origin.
     """
 
     piece: np.ndarray
@@ -46,8 +50,12 @@ class Rigid(NamedTuple):
 
 
 class Resistance(NamedTuple):
-    """Second variation `(3 c, 3 c)` and slope `(3 c,)` of an energy along the rigid motions, and the `noise` in the
-    former."""
+    """How a term resists the rigid motions of `c` pieces.
+
+    second: `(3 c, 3 c)` second variation of its energy along the motions.
+    slope: `(3 c,)` first derivative of its energy along the motions.
+    noise: round-off of `second`.
+    """
 
     second: np.ndarray
     slope: np.ndarray
@@ -55,15 +63,15 @@ class Resistance(NamedTuple):
 
 
 def check_held(scene: Scene) -> None:
-    """Refuse a scene in which a piece of the mesh moves rigidly, against no clamp, no spring and no load.
+    """Refuse a scene in which a piece of the mesh can move rigidly and no clamp, spring or load resists.
 
-    Its tangent stiffness would be singular at rest. A solid or a rod itself never resists a rigid motion, so only
-    the other terms are asked, and only if clamped nodes alone do not hold every piece. A load that drives the motion
-    instead, as one that stands on a hinge, leaves no singular stiffness: what becomes of it the solver finds.
+    The tangent stiffness of such a scene is singular at rest. A solid or a rod never resists a rigid motion of its own,
+    so only the other terms are evaluated, and only if the clamped nodes alone do not hold every piece. A load may also
+    drive the motion, such as a load that stands on a hinge. Then the stiffness is not singular, and the scene passes:
+    the solver finds where it goes. Nothing is refused while a value is traced, or where an energy is not finite.
 
     Raises:
-        ValueError: that names the piece and its free motions. Nothing is checked while a value is traced, or where an
-            energy is not finite.
+        ValueError: if a piece is not held; it names the piece and its free motions.
     """
     known = is_concrete(scene.mesh.elements, scene.fixed)
     if known and _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
@@ -92,7 +100,7 @@ def check_held(scene: Scene) -> None:
 
 @lru_cache(maxsize=32)
 def _clamps_suffice(elements: Key, fixed: Key) -> bool:
-    """Whether each piece of the mesh has as many clamped nodes as hold it wherever they are: two, or one of a rod."""
+    """Whether each piece has enough clamped nodes to be held, wherever these lie: two nodes, or one of a rod."""
     piece = pieces(elements.array, fixed.array.shape[0])
     enough = 2 if fixed.array.shape[1] == 2 else 1
     return bool((np.bincount(piece, fixed.array.all(axis=1)) >= enough).all())
@@ -111,7 +119,7 @@ def _rigid_motions(scene: Scene) -> Rigid:
     slope[node, 0, piece, 0] = slope[node, 1, piece, 1] = 1
     slope[node, :2, piece, 2] = arms[:, ::-1] * [-1, 1] / size[:, None]
     if scene.mesh.radian is not None:
-        # The third coordinate is an angle: it turns at a constant rate.
+        # The third coordinate is an angle times `radian`. It is linear in the rotation and has no second derivative.
         slope[node, 2, piece, 2] = float(scene.mesh.radian) / size
     bend[:, :2] = -arms / size[:, None] ** 2
     far[:, :2] = (np.abs(arms) + np.abs(rest)) / size[:, None] ** 2
@@ -119,9 +127,9 @@ def _rigid_motions(scene: Scene) -> Rigid:
 
 
 def _unresisted(scene: Scene, rigid: Rigid, free: np.ndarray) -> np.ndarray:
-    """Of the motions `free` `(3 c, f)` that the fixed coordinates leave, those `(3 c, u)` that no term resists."""
+    """The motions `(3 c, u)` that no term resists, of the motions `free` `(3 c, f)` that fixed coordinates leave."""
     eps = float(np.finfo(scene.mesh.nodes.dtype).eps)
-    # Inside jit too the scene is constant, and so are these.
+    # The scene is concrete, so its derivatives are constants, inside jit too.
     with jax.ensure_compile_time_eval():
         derivatives = jax.device_get(_derivatives(unlock(scene), scene.mesh.nodes))
     if not all(np.isfinite(each).all() for each in jax.tree.leaves(derivatives)):
@@ -129,7 +137,7 @@ def _unresisted(scene: Scene, rigid: Rigid, free: np.ndarray) -> np.ndarray:
     found = [_resistance(term, g, H, rigid, eps) for term, (g, H) in zip(scene.terms, derivatives, strict=True)]
     second, slope = (np.sum(parts, axis=0) for parts in ([f.second for f in found], [f.slope for f in found]))
     noise = sum(f.noise for f in found)
-    # A fixed coordinate keeps its place to second order too: what holds it there acts like a load on a moving node.
+    # A fixed coordinate must not move to second order either. Its reaction acts like a load on a moving node.
     reactions = np.linalg.lstsq(rigid.slope[scene.fixed].T, slope)[0]
     turns = 3 * rigid.piece[np.nonzero(scene.fixed)[0]] + 2
     np.add.at(second, (turns, turns), -reactions * rigid.bend[scene.fixed])
@@ -145,10 +153,17 @@ def _derivatives(scene: Scene, x: jax.Array) -> list[tuple[jax.Array, jax.Array]
 
 
 def _resistance(term: Term, gradients: np.ndarray, hessians: np.ndarray, rigid: Rigid, eps: float) -> Resistance:
-    """The resistance of a term whose stencils have these derivatives.
+    """The resistance of a term.
 
-    The round-off of each stencil is dropped before stencils are added up. Otherwise that of a stiff tendon inside a
-    piece would count as resistance, or hide the resistance of a weak spring.
+    Values below the round-off of their stencil are set to zero before stencils are added up. Otherwise the round-off of
+    a stiff tendon inside a piece would count as resistance, or hide the resistance of a weak spring.
+
+    Args:
+        term: with `m` stencils of `k` nodes.
+        gradients: `(m, k, d)` of its stencils.
+        hessians: `(k d, k d, m)` of its stencils.
+        rigid: the motions.
+        eps: of the scene's dtype.
     """
     size = rigid.slope.shape[2]
     second, slope, noise = np.zeros((size, size)), np.zeros(size), 0.0
@@ -171,7 +186,7 @@ def _resistance(term: Term, gradients: np.ndarray, hessians: np.ndarray, rigid: 
         values, vectors = np.linalg.eigh(each)
         values = np.where(np.abs(values) > NOISE * eps * (stiff + force)[:, None], values, 0)
         second[np.ix_(used, used)] += np.einsum("mpr,mr,mqr->pq", vectors, values, vectors)
-        # Forces keep an error of eps; a stiffness that is left has directions wrong by eps, which enter squared.
+        # Forces have a relative error of eps. Directions of a remaining stiffness are wrong by eps, and enter squared.
         rough = NOISE * eps * force + max(NOISE * float(np.finfo(float).eps), (NOISE * eps) ** 2) * stiff
         noise += float(rough[values.any(axis=1)].sum())
         pulls, most = np.einsum("ma,map->mp", flat, J), np.einsum("ma,map->mp", np.abs(flat), np.abs(J))

@@ -1,4 +1,4 @@
-"""Where the way to an equilibrium begins, as data, and the scenes on that way."""
+"""The origin of a continuation: a known state, and the scenes between it and the scene to be solved."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jaxbeam.scene.scene import Scene, command, commands_of, partway, rest_comma
 
 
 class Origin(NamedTuple):
-    """A state of the same scene under other commands, from which its equilibrium is approached.
+    """A known state of the scene under other commands, from which the equilibrium is approached.
 
-    commands: `(m,)` of that state.
-    loaded: `()` the share of the loads that acts on it.
+    commands: `(m,)` commands of that state.
+    loaded: `()` share of the loads that acts in it.
     x: `(n, d)` its positions.
-    ahead: `(n, d)` how far the equilibrium is predicted to lie from it.
-    known: `()` int32, 1 where there is such a prediction, else 0.
-    first: `(n, d)` where Newton's method starts, before `ahead` is added.
+    ahead: `(n, d)` predicted displacement from `x` to the equilibrium; zero if there is no prediction.
+    known: `()` int32, 1 if `ahead` is a prediction, else 0.
+    first: `(n, d)` positions that the first attempt starts from, before `ahead` is added.
     """
 
     commands: Any
@@ -33,9 +33,9 @@ class Origin(NamedTuple):
 
 
 def from_rest(scene: Scene, x: Any = None) -> Origin:
-    """The origin without any actuation or load. The first attempt starts at `x`, by default at rest.
+    """The origin at rest, without actuation or loads. The first attempt starts at `x` `(n, d)`, by default at rest.
 
-    It is made without arithmetic, for which JAX would compile a program for each shape.
+    The arrays are made without JAX arithmetic, which would compile a program for each shape.
     """
     rest = scene.mesh.nodes
     at_rest = rest_commands(scene)
@@ -51,18 +51,25 @@ def from_rest(scene: Scene, x: Any = None) -> Origin:
 
 @lru_cache(maxsize=64)
 def _kept(values: float | tuple[float, ...], shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
-    """Numbers on the device, kept: to send NumPy's there took a third of the time in which a call returns."""
+    """Constants on the device, cached: sending them there anew took a third of the time until a call returns."""
     return to_device(np.broadcast_to(np.asarray(values, dtype), shape))
 
 
 def from_neighbour(commands: Any, x: Any, ahead: Any) -> Origin:
-    """The origin in the equilibrium `x` of other `commands` `(m,)`, with a prediction `ahead` of it."""
+    """The origin at the equilibrium under other commands.
+
+    Args:
+        commands: `(m,)` the other commands.
+        x: `(n, d)` positions of their equilibrium.
+        ahead: `(n, d)` predicted displacement from `x` to the equilibrium to be solved for.
+    """
     return Origin(commands, np.ones((), commands.dtype), x, ahead, np.int32(1), x)
 
 
 def scene_between(origin: Origin, scene: Scene, s: jax.Array) -> Scene:
-    """The scene at the share `s` of the way from the origin, 0, to the scene itself, 1."""
+    """The scene at `s` `()`: commands and loads change linearly from the origin (`s = 0`) to `scene` (`s = 1`)."""
     commands = (1 - s) * origin.commands + s * commands_of(scene)
     between = command(partway(scene, (1 - s) * origin.loaded + s), commands)
-    # At the end it is the scene to the last bit. What no command changes is the same array in both.
+    # At `s = 1` take the leaves of `scene`, to the last bit. A leaf that no command or load changes is the same array
+    # in both.
     return jax.tree.map(lambda own, other: own if own is other else jnp.where(s == 1, own, other), scene, between)

@@ -1,10 +1,10 @@
 """Continuation: equilibria along a path of scenes, by as many Newton solves as it takes.
 
 The path has a parameter `s`; an equilibrium is asked for at each of a few targets. A single equilibrium is a path with
-one target. All solves share one Newton loop in the compiled program, whatever happens on the way.
+one target. The compiled program has a single Newton loop, which all solves share.
 
 An *attempt* is one Newton solve from a predicted start. Its state is *accepted* if it converged, unless it is a saddle
-or the increment may have been too long (see `_judge`). After an attempt that fails the increment is halved.
+or the increment may have been too long (see `_judge`). After a failed attempt the increment is halved.
 """
 
 from __future__ import annotations
@@ -29,29 +29,24 @@ from jaxbeam.solve.report import PackedReport, Report, pack, unpack, zeros
 from jaxbeam.solve.solution import Solution, Status
 from jaxbeam.solve.stiffness import zero_factor
 
-# Newton steps of the first attempt at a target: if it takes more, a shorter increment is quicker. Each failure allows
-# the next attempt this many more, because past a fold no increment is short enough.
+# The most Newton steps of the first attempt at a target. If it needs more, a shorter increment is quicker. Each failed
+# attempt allows the next one this many more, because past a fold no increment is short enough.
 ATTEMPT_STEPS = 60
 
-
-# First steps of an attempt from a predicted start, which need not lower the energy: beside a stiff tendon the energy
-# has a curved valley, and a line search crawls along it.
+# In an attempt from a predicted start this many first steps need not lower the energy. Beside a stiff tendon the energy
+# has a curved valley, along which a line search advances very slowly.
 FULL_STEPS = 8
-
 
 # Failed attempts at a target before it is given up.
 MAX_CUTS = 20
 
-
-# Saddles that are left, one after the other, before one is accepted.
+# Consecutive saddles that are left before one is accepted.
 MAX_ESCAPES = 4
 
-
-# Length of the first displacement from a saddle, over the size of the body.
+# Largest component of the displacement away from a saddle, over the size of the body.
 ESCAPE = 1e-3
 
-
-# Attempts at one target, whatever they cost.
+# The most attempts at one target, however few steps they take.
 MAX_ATTEMPTS = 100
 
 
@@ -59,14 +54,14 @@ MAX_ATTEMPTS = 100
 
 
 class Problem(NamedTuple):
-    """What does not change during one continuation.
+    """The inputs of a continuation, which do not change while it runs.
 
-    scene_at: from the parameter `s` to the scene, with unlocked indices.
-    layout: of its matrix.
+    scene_at: function of the parameter `s` that returns the scene, with unlocked indices.
+    layout: layout of the stiffness matrix.
     targets: `(S,)` parameters at which an equilibrium is asked for, increasing.
-    valid: `(S,)` whether every parameter of the scene is in its range there.
-    noise: `(n, d)` random forces, to find soft modes with.
-    solver: settings.
+    valid: `(S,)` whether every parameter of the scene is in its range at each target.
+    noise: `(n, d)` random forces; the response to them shows the soft modes.
+    solver: settings of Newton's method.
     """
 
     scene_at: Callable[[jax.Array], Scene]
@@ -78,13 +73,13 @@ class Problem(NamedTuple):
 
 
 class Spent(NamedTuple):
-    """What the attempts at the present target have taken so far; each an int32 `()`.
+    """Totals over the attempts at the present target so far; each an int32 `()`.
 
-    steps: Newton steps.
-    projected: Newton steps with a modified stiffness.
-    halvings: halvings of the line search.
-    attempts: attempts.
-    status: flags of the last attempt.
+    steps: number of Newton steps.
+    projected: number of Newton steps with a modified stiffness.
+    halvings: number of halvings of the line search.
+    attempts: number of attempts.
+    status: flags of the last attempt, no total.
     """
 
     steps: jax.Array
@@ -98,17 +93,18 @@ class Continuation(NamedTuple):
     """State of a continuation.
 
     target: `()` index of the present target.
-    trail: the accepted states so far, with the parameter of each; the newest first.
-    accepted: `(n, d)` positions of the newest one as solved for. `trail` stores them with the last correction added.
+    trail: the last accepted states with their parameters, newest first.
+    accepted: `(n, d)` positions of the newest accepted state as solved for. `trail` stores them with the last Newton
+        step added (see `_extend`).
     parameter: `()` value of `s` at the next attempt.
-    start: `(n, d)` positions that the next attempt starts from.
-    displacement: `(n, d)` added to these: the predictor, or the way out of a saddle.
-    factor: of the stiffness at the end of the last attempt.
-    increment: `()` step in `s` from the newest accepted state.
-    cuts: `()` failed attempts at this target.
-    escapes: `()` saddles left since the newest accepted state.
-    spent: what this target has taken so far.
-    path: packed reports, with leading axis `S`.
+    start: `(n, d)` positions that the next attempt starts from, before `displacement` is added.
+    displacement: `(n, d)` prediction from `start`, or the displacement away from a saddle.
+    factor: factor of the stiffness at the end of the last attempt.
+    increment: `()` continuation step in `s` from the newest accepted state.
+    cuts: `()` number of failed attempts since the last target that was reached with status `OK`.
+    escapes: `()` number of saddles left since the newest accepted state.
+    spent: totals over the attempts at the present target.
+    path: packed reports of all targets, with leading axis `S`.
     given_up: `()` whether the target is given up. Then the next attempt takes no step: it only evaluates the newest
         accepted state with the forces of the target.
     running: `()` whether another attempt is to be made.
@@ -131,13 +127,13 @@ class Continuation(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What to make of an attempt; each `()`.
+    """How an attempt ended; each a boolean `()`.
 
-    accepted: its state is one to continue from.
-    landed: it is accepted, and at the target.
-    saddle: it converged to a saddle, which is left.
-    failed: neither accepted nor a saddle.
-    give_up: the target is not reached, and no further attempt may be made.
+    accepted: the continuation goes on from its state.
+    landed: it is accepted, and its parameter is that of the target.
+    saddle: it converged to a saddle, which the next attempt leaves.
+    failed: it is neither accepted nor such a saddle.
+    give_up: the target is not reached, and no further attempt is allowed.
     """
 
     accepted: jax.Array
@@ -161,21 +157,23 @@ def follow(
 ) -> tuple[Solution, Any, Trail]:
     """Equilibria of `scene_at(s)` at each of the targets, each started from the one before.
 
-    The first attempt goes straight to the first target. After one that fails the increment is halved, and the next
-    starts from the newest accepted state; the increment doubles while attempts succeed. When it has become too small
-    the continuation ends: the remaining targets are reported `NOT_CONVERGED`, at the newest accepted state.
+    The first attempt goes straight to the first target. After a failed attempt the increment is halved, and the next
+    attempt starts from the newest accepted state. After an accepted one the increment is doubled. When no further
+    attempt is allowed (see `_judge`) the continuation ends: the remaining targets are reported `NOT_CONVERGED`, at the
+    newest accepted state.
 
     Args:
-        scene_at: from the parameter to the scene, with unlocked indices.
-        layout: of its matrix.
+        scene_at: function of the parameter `s` that returns the scene, with unlocked indices.
+        layout: layout of the stiffness matrix.
         trail: known states; the newest one, at `s = 0`, is in equilibrium or at rest.
         targets: `(S,)` increasing parameters.
-        solver: settings.
+        solver: settings of Newton's method.
         x: `(n, d)` positions that the first attempt starts from; by default the newest state of `trail`.
-        displacement: `(n, d)` added to these; by default along the tangent of the trail, or zero with an `x`.
+        displacement: `(n, d)` added to `x`; by default the tangent predictor of `trail`, or zero if `x` is given.
 
     Returns:
-        The solutions, with leading axis `S`; the factor of the stiffness at the last; and the trail that ends there.
+        The solutions, with leading axis `S`; the factor of the stiffness at the last one; and the trail that ends
+        there.
     """
     valid = jax.vmap(lambda s: is_valid(scene_at(s)))(targets)
     noise = np.random.default_rng(0).standard_normal(trail.x[0].shape).astype(trail.x.dtype)
@@ -186,7 +184,7 @@ def follow(
 
 
 def init(problem: Problem, trail: Trail, x: jax.Array | None, displacement: jax.Array | None) -> Continuation:
-    """The state before the first attempt; arguments as of `follow`."""
+    """The state before the first attempt; arguments as in `follow`."""
     targets, newest = problem.targets, trail.x[0]
     if displacement is None:
         displacement = jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0)
@@ -245,7 +243,8 @@ def step(problem: Problem, state: Continuation) -> Continuation:
 def _attempt(problem: Problem, state: Continuation, scene: Scene, max_steps: jax.Array) -> newton.State:
     """One Newton solve of the scene at the present parameter.
 
-    Its probe gives the tangent of the branch. At a saddle it gives a soft mode, to leave it along.
+    The response to its probe is the tangent of the branch. At a saddle it is a soft mode, along which the next attempt
+    leaves.
     """
     one = jnp.ones((), state.parameter.dtype)
     gradient = lambda s, x: jax.grad(energy, argnums=1)(problem.scene_at(s), x)
@@ -253,20 +252,20 @@ def _attempt(problem: Problem, state: Continuation, scene: Scene, max_steps: jax
     policy = newton.Policy(
         max_steps=jnp.where(state.given_up, 0, max_steps),
         full_steps=jnp.where(state.trail.depth > 0, FULL_STEPS, 0),
-        # Intermediate states of a ramp: all but the last.
+        # Allowed at the intermediate states of a ramp: at all but the last.
         reuse_factor=state.parameter < problem.targets[-1] if len(problem.targets) > 1 else None,
         leaving_saddle=state.escapes > 0,
-        # The factor at a saddle filters the soft modes out of noise.
+        # At a saddle the response to random forces consists mostly of soft modes.
         probe=lambda x, definite: jnp.where(definite, rate(x), problem.noise),
     )
     return newton.newton(scene, problem.layout, state.start, state.displacement, policy, problem.solver)
 
 
 def _report(problem: Problem, state: Continuation, scene: Scene, attempt: newton.State) -> Report:
-    """The report of an attempt, together with the earlier attempts at the same target.
+    """The report of an attempt; its counts include the earlier attempts at the same target.
 
-    For a target that is given up, the evaluation at the end is not counted as an attempt, flags of the last attempt
-    are kept, and `reached` tells how much of the way was covered.
+    For a target that is given up, the final evaluation is not counted as an attempt, the flags `NONFINITE` and
+    `INVALID` of the last attempt are kept, and `reached` is the fraction of the way to the target that was covered.
     """
     spent, counts, given_up = state.spent, attempt.counts, state.given_up
     volume, element = worst_element(scene, attempt.x)
@@ -297,7 +296,7 @@ def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume:
     raised = {
         Status.NOT_CONVERGED: ~converged,
         Status.NONFINITE: ~finite,
-        # True for NaN.
+        # True for a `volume` of NaN too.
         Status.INVERTED: ~(volume > 0),
         Status.UNSTABLE: converged & ~definite & ~marginal,
         Status.INACCURATE: converged & inaccurate,
@@ -310,17 +309,22 @@ def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume:
 def _judge(
     problem: Problem, state: Continuation, attempt: newton.State, report: Report, max_steps: jax.Array
 ) -> Verdict:
-    """The verdict on an attempt of at most `max_steps` `()` steps."""
+    """The verdict on an attempt of at most `max_steps` `()` steps.
+
+    A target is given up when the solver's Newton steps or `MAX_ATTEMPTS` are used up, when a parameter of its scene is
+    out of range, or when an attempt fails and the increment may not be halved again.
+    """
     solver, status = problem.solver, report.status
     converged = (status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID)) == 0
     unstable = (status & Status.UNSTABLE) != 0
     saddle = converged & unstable & (state.escapes < (MAX_ESCAPES if solver.escape else 0))
     used_up = (report.steps >= solver.max_steps) | (report.attempts >= MAX_ATTEMPTS) | ~problem.valid[state.target]
     may_cut = (state.cuts < MAX_CUTS) & (state.parameter > state.trail.s[0]) & ~used_up
-    # The increment may have been too long for an inverted state: it is accepted only where shorter ones lead there too.
+    # An inverted state may come of too long an increment. It counts as failed as long as the increment may be halved,
+    # and is accepted only if shorter increments lead to it too.
     inverted = (status & Status.INVERTED) != 0
-    # Likewise for a state that balances with almost no stiffness left when its steps are used up: past a fold, Newton's
-    # method creeps by such states.
+    # The same holds for a state that uses up the steps of its attempt and is in balance with almost no stiffness left:
+    # past a fold Newton's method creeps through such states.
     creeping = (attempt.counts.steps >= max_steps) & (attempt.correction > INACCURATE)
     accepted = converged & ~saddle & ~((inverted | creeping) & may_cut) & ~state.given_up
     landed = accepted & (state.parameter == problem.targets[state.target])
@@ -329,10 +333,10 @@ def _judge(
 
 
 def _extend(state: Continuation, attempt: newton.State, verdict: Verdict) -> Trail:
-    """The trail, with the state of an accepted attempt.
+    """The trail, with the state of the attempt added if it is accepted.
 
-    The last Newton step, which was computed but not taken, is added to its positions. It doubles the number of correct
-    digits, and the polynomial of the predictor does not amplify what is left unbalanced.
+    The last Newton step, which was computed but not taken, is added to the positions. It doubles the number of correct
+    digits; without it the predictor's polynomial would amplify the error that the residual leaves in them.
     """
     known = attempt.stiffness.definite & jnp.all(jnp.isfinite(attempt.response))
     corrected = attempt.x + jnp.where(known & (attempt.correction <= INACCURATE), attempt.step, 0)
@@ -345,11 +349,11 @@ def _next_parameter(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The index of the next target, the parameter of the next attempt, and the increment; each `()`."""
     cut = jnp.where(verdict.saddle, state.increment, 0.5 * (state.parameter - trail.s[0]))
-    # After a target that was reached at once, the next one is tried at once.
+    # If the first attempt reached the target, the first attempt at the next target goes straight there too.
     easy = verdict.landed & ((report.attempts == 1) | (state.increment <= 0))
     increment = jnp.where(easy, 1.0, jnp.where(verdict.accepted, 2 * state.increment, cut)).astype(trail.x.dtype)
     target = jnp.minimum(state.target + verdict.landed.astype(jnp.int32), len(problem.targets) - 1)
-    # An attempt just short of the target would leave an increment of almost nothing.
+    # Do not stop just short of the target: the increment left would be almost zero.
     to_target = verdict.give_up | (trail.s[0] + 1.01 * increment >= problem.targets[target])
     parameter = jnp.where(to_target, problem.targets[target], trail.s[0] + increment)
     leave = verdict.saddle & ~verdict.give_up
@@ -365,7 +369,7 @@ def _next_start(
     accepted: jax.Array,
     parameter: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Positions `(n, d)` that the next attempt, at `parameter`, starts from, and the displacement added to these."""
+    """Positions `(n, d)` that the next attempt, at `parameter`, starts from, and the displacement added to them."""
     leave = verdict.saddle & ~verdict.give_up
     start = jnp.where(leave, attempt.x, jnp.where(verdict.give_up, accepted, trail.x[0]))
     scale = ESCAPE * extent(scene) / jnp.max(jnp.abs(attempt.response))
@@ -375,7 +379,7 @@ def _next_start(
 
 
 def _write(state: Continuation, report: Report, final: jax.Array) -> PackedReport:
-    """The path, with the report of the present target if that is `final`."""
+    """The packed reports of all targets, with this report of the present one written if it is `final` `()`."""
     write = lambda all, new: all.at[state.target].set(jnp.where(final, new, all[state.target]))
     return jax.tree.map(write, state.path, pack(report))
 
@@ -383,7 +387,7 @@ def _write(state: Continuation, report: Report, final: jax.Array) -> PackedRepor
 def _solutions(problem: Problem, state: Continuation) -> Solution:
     """The solutions at all targets, with leading axis `S`, from the final state of a continuation."""
     scene_at, targets = problem.scene_at, problem.targets
-    # Targets after one that was given up are given up in the same state.
+    # Targets after one that was given up get its report.
     row = jnp.minimum(jnp.arange(len(targets), dtype=jnp.int32), state.target)
     path = jax.tree.map(lambda all: all[row], state.path)
     ratios = jax.vmap(lambda s: commands_of(scene_at(s)))(targets)

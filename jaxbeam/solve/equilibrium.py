@@ -1,8 +1,8 @@
-"""Quasistatic equilibrium: what is asked, what is answered, and how far the answer can be trusted.
+"""Quasistatic equilibrium of one scene, its linear approximation, and the derivatives of both.
 
-At equilibrium the gradient of the energy vanishes at every free coordinate. It is stable if the Hessian
-there is positive definite. One Newton solve (`jaxbeam.solve.newton`) is an attempt; `follow` makes as many as it
-takes to get along a path of scenes, and a single equilibrium is the shortest of paths.
+At equilibrium the gradient of the energy vanishes at every free coordinate. The equilibrium is stable if the Hessian
+there is positive definite. `follow` (`jaxbeam.solve.continuation`) makes as many Newton solves as it takes to follow a
+path of scenes. A single equilibrium is a path with one target.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ from jaxbeam.solve.solution import Solution
 def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton()) -> Solution:
     """Node positions at which all forces balance.
 
-    Newton's method starts at `x0`. If it fails, the actuation is approached from rest in steps as small as it
-    takes; if it ends on a saddle, it leaves for the stable state beside it (unless `solver.escape` is false).
+    Newton's method starts at `x0`. If it fails, commands and loads are increased from rest in steps as small as needed.
+    If it converges to a saddle, it goes on to the stable state beside it (unless `solver.escape` is false).
 
     `x`, `energy`, `smallest_jacobian` and `ratios` are differentiable in every float of the scene, forward, reverse
-    and to any order, by one back-substitution (see `jaxbeam.solve.implicit`); not in `x0`. The derivative is NaN where
-    the status is not `OK`, and does not exist at a fold.
+    and to any order, but not in `x0`. The derivative takes one back-substitution (see `jaxbeam.solve.implicit`). It is
+    NaN where the status is not `OK`, and does not exist at a fold.
 
     Args:
         scene: what to solve.
-        x0: `(n, 2)` start; by default the rest positions. Fixed coordinates are put at rest.
+        x0: `(n, d)` start positions; by default the rest positions. Fixed coordinates are put at rest.
         solver: settings.
 
     Returns:
-        A `Solution`. It never raises for a solve that fails: its `status` says so, and `check` raises.
+        A `Solution`. A solve that fails raises no error: `status` tells that it failed, and `check` raises.
 
     Raises:
         ValueError: if `x0` has another shape, or is concrete and not finite or inverts an element, or if a
@@ -78,16 +78,21 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
 
 @usual_rules
 def linear_response(scene: Scene, linear: LinearSolver = BlockTridiagonal()) -> jax.Array:
-    """Node positions `(n, 2)` by linear elasticity: the solution of one linear system, no more.
+    """Node positions `(n, d)` by linear elasticity: the solution of a single linear system.
 
-    The energy is expanded to second order about rest, tendons and all, so displacements are in proportion to small
-    commands and loads. It is cheap and exact for those, and there is nothing in it that tells how wrong it is for
-    larger ones: on the reference scene it bends too little by 7 % at a ratio of 0.95 and by a quarter at 0.8, where the
+    The energy of all terms, tendons included, is expanded to second order about rest, so displacements are proportional
+    to small commands and loads. The result is cheap, and exact for small ones. For larger ones it does not tell how
+    wrong it is: on the reference scene it bends too little by 7 % at a ratio of 0.95 and by a quarter at 0.8, where the
     hand calculation (`euler_bernoulli`) is right to 0.3 %.
 
+    Args:
+        scene: what to solve.
+        linear: the linear solver.
+
     Raises:
-        ValueError: if a piece of the mesh is not held, or the scene is not stable at rest: then a small command or load
-            does not lead to a state near rest. Inside jit free coordinates are NaN then.
+        ValueError: if a piece of the mesh is not held, or if the scene is not stable at rest, so that a small command
+            or load does not lead to a state near rest. Inside jit an unstable scene gives free coordinates of NaN
+            instead.
     """
     check_scene(scene)
     check_linear("linear", linear)
@@ -106,7 +111,10 @@ def linear_response(scene: Scene, linear: LinearSolver = BlockTridiagonal()) -> 
 
 @compiled("linear")
 def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array, Any]:
-    """The positions, whether the stiffness at rest is positive definite, and its factor: if not, it makes them NaN."""
+    """Positions `(n, d)` by linear elasticity, whether the stiffness at rest is positive definite `()`, and its factor.
+
+    If the stiffness is not positive definite, its factor contains NaN, and free coordinates are NaN.
+    """
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
     step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
@@ -117,8 +125,9 @@ def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tupl
 def _moving_response(
     scene: Scene, layout: Layout, x: jax.Array, stable: jax.Array, factor: Any, linear: LinearSolver
 ) -> jax.Array:
-    """The linear response `x` as a function of the scene."""
-    # NaN is added at the end: in a slope it would spread to what does not look at it.
+    """The linear response `x`, with its derivative in the scene attached."""
+    # The NaN of an unstable scene is added at the end. As part of a derivative it would spread to results that do not
+    # depend on this one.
     finite = jnp.where(stable, x, lax.stop_gradient(scene.mesh.nodes))
     moving = attach_derivative_of_root(linear, linear_gradient, scene, layout, finite, factor, stable)
     return moving + jnp.where(stable | scene.fixed, 0, jnp.nan).astype(x.dtype)
@@ -126,20 +135,25 @@ def _moving_response(
 
 @compiled("solver")
 def solve_from(origin: Origin, scene: Scene, layout: Layout, solver: Newton) -> tuple[Solution, Any]:
-    """The equilibrium of an unlocked scene and the factor of its stiffness; approached from `origin` if need be.
+    """The equilibrium of an unlocked scene and the factor of its stiffness.
 
-    Where the origin lies is data: `equilibrium` and the searches of `reach` run the same compiled program.
+    The first attempt starts at `origin.first + origin.ahead`. If it fails, the scene is approached from `origin` in
+    smaller increments. The origin is data, not structure: `equilibrium` and the searches of `reach` run the same
+    compiled program.
     """
     trail = start_trail(origin.x, origin.ahead)._replace(depth=origin.known)
-    way = lambda s: scene_between(origin, scene, s)
+    scene_at = lambda s: scene_between(origin, scene, s)
     targets = jnp.ones(1, scene.mesh.nodes.dtype)
-    path, factor, _ = follow(way, layout, trail, targets, solver, origin.first, origin.ahead)
+    path, factor, _ = follow(scene_at, layout, trail, targets, solver, origin.first, origin.ahead)
     return jax.tree.map(lambda leaf: leaf[0], path), factor
 
 
 @partial(jax.jit, static_argnames="solver")
 def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any, solver: Newton) -> Solution:
-    """The solution as a function of the scene: `x`, `energy`, `smallest_jacobian` and `ratios` move with it."""
+    """The solution, with derivatives in the scene attached to `x`, `energy`, `smallest_jacobian` and `ratios`.
+
+    `factor` is as in `attach_derivative`.
+    """
     x = attach_derivative(solver.linear, scene, layout, solution.x, factor, solution.status == 0)
     return replace(
         solution, x=x, energy=energy(scene, x), smallest_jacobian=smallest_jacobian(scene, x), ratios=commands_of(scene)
@@ -148,10 +162,10 @@ def differentiable(scene: Scene, layout: Layout, solution: Solution, factor: Any
 
 @custom_derivative
 def _sane(commands: jax.Array, rest: jax.Array, good: jax.Array) -> jax.Array:
-    """The command of a good row; that at rest in place of a bad one, which may be NaN. Derivatives pass through.
+    """`commands` `(m,)` if `good` `()`, else `rest` `(m,)`; in both cases the derivative is that of `commands`.
 
-    What nobody looks at has cotangent zero; times the slope of a bad command that would still be NaN, and spread
-    from one row to the parameters that all rows share.
+    A bad row may be NaN. If the loss does not depend on it, its cotangent is zero; but zero times the derivative at NaN
+    commands is NaN, and would spread to the parameters that all rows share.
     """
     return jnp.where(good, commands, rest)
 
@@ -163,9 +177,9 @@ def _sane_jvp(primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]) -
 
 @partial(jax.jit, static_argnames="solver")
 def differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: Solution, solver: Newton) -> Solution:
-    """Solutions `(B, ...)` of the commands `rows` `(B, m)` as functions of these and of the scene.
+    """Solutions `(B, ...)` of the commands `rows` `(B, m)`, with derivatives in the commands and the scene attached.
 
-    Factors are not kept, they would outgrow any memory: one is made anew for each row that is differentiated.
+    The factors of all rows would not fit in memory. Each row is factorised anew when it is differentiated.
     """
 
     @jax.checkpoint
@@ -180,7 +194,7 @@ def differentiable_rows(scene: Scene, layout: Layout, rows: jax.Array, found: So
 
 
 def start(scene: Scene, x0: Numbers | None) -> jax.Array:
-    """`x0` `(n, 2)` in the scene's dtype, with fixed coordinates at rest."""
+    """`x0` `(n, d)` in the scene's dtype, with fixed coordinates at rest; the rest positions if it is None."""
     rest = scene.mesh.nodes
     if x0 is None:
         return rest
@@ -192,7 +206,7 @@ def start(scene: Scene, x0: Numbers | None) -> jax.Array:
             node = np.flatnonzero(~finite)[0]
             raise ValueError(f"x0: expected finite positions, got {np.asarray(x0)[node].tolist()} at node {node}")
         volume, element = _worst_element(unlock(scene), x)
-        # Inside jit it is traced although all that it is made of is not.
+        # Inside jit a jitted function returns a tracer even for concrete arguments.
         if is_concrete(volume) and not volume > 0:
             raise ValueError(
                 f"x0: element {element} is inverted (J = {float(volume):.3g}); start from rest, or from a "

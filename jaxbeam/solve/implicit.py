@@ -9,8 +9,8 @@ derivative does not depend on where they started. Both sides of the equation are
 JAX can differentiate them again: forward, reverse and to any order.
 
 The derivative exists where `K` is not singular: at every stable solution, but not at a fold. Where the status of the
-solution is not `OK` it is NaN; zero could be mistaken for an answer. A failed member of a batch does not affect the
-others as long as the loss does not depend on it (its cotangent is exactly zero).
+solution is not `OK` the derivative is NaN, because zero could be mistaken for an answer. A failed member of a batch
+does not affect the others as long as the loss does not depend on it (its cotangent is exactly zero).
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ def attach_derivative(
     Args:
         linear: the linear solver.
         scene: with unlocked indices; differentiable in all its floats.
-        layout: of its matrix.
+        layout: layout of the stiffness matrix.
         x: `(n, d)` an equilibrium of the scene. A tangent of `x` itself is ignored.
-        factor: of the true stiffness at `x`; None to factorise it when a derivative is asked for.
+        factor: factor of the true stiffness at `x`; None to factorise it when a derivative is asked for.
         trusted: `()` whether `x` is an equilibrium with a positive definite stiffness. If not, the derivative is NaN.
     """
     return attach_derivative_of_root(linear, energy_gradient, scene, layout, x, factor, trusted)
@@ -91,11 +91,11 @@ def attach_derivative_of_root(
     Args:
         linear: the linear solver.
         gradient: `energy_gradient` or `linear_gradient`.
-        scene: as of `attach_derivative`.
-        layout: as of `attach_derivative`.
+        scene: as in `attach_derivative`.
+        layout: as in `attach_derivative`.
         x: `(n, d)` positions at which the gradient is zero on free coordinates.
-        factor: of the derivative of `gradient` in `x`. None is allowed with `energy_gradient` only.
-        trusted: as of `attach_derivative`.
+        factor: factor of the derivative of `gradient` in `x`. None is allowed with `energy_gradient` only.
+        trusted: as in `attach_derivative`.
     """
     return x
 
@@ -107,7 +107,7 @@ def _attach_derivative_jvp(
     scene, layout, found, factor, trusted = primals
     scene_dot = tangents[0]
     x = attach_derivative_of_root(linear, gradient, *primals)
-    # The derivative of a failed solution is NaN. Keep it out of second derivatives that do not depend on it.
+    # The derivative of a failed solution is NaN. Keep it out of second derivatives that do not depend on `x`.
     at = jnp.where(trusted, x, found)
     if factor is None:
         factor, _ = linear.factor(layout, assemble(layout, stencil_hessians(*lax.stop_gradient((scene, found)))))
@@ -119,9 +119,10 @@ def _attach_derivative_jvp(
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
         y = _solve(linear)(layout, factor, b)
+        # NaN if not trusted, except for a zero right-hand side: that of a loss that does not depend on this solution.
         return jnp.where(trusted, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(y.dtype))
 
-    # Fixed coordinates stay at rest: they move with the rest positions.
+    # Fixed coordinates are at their rest positions, and have the tangent of these.
     fixed_dot = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
     gradient_dot = jax.jvp(gradient, (scene, at), (scene_dot, fixed_dot))[1]
     free_dot = lax.custom_linear_solve(product, -gather(layout, gradient_dot), solve, symmetric=True)

@@ -1,8 +1,8 @@
-"""Line search: a step that may not lower the energy is halved until it does.
+"""Line search: a step is halved until it lowers the energy.
 
-Armijo's condition decides far from the solution. Near it, differences of energy drown in round-off, and the slope
-decides: the approximate Wolfe condition of Hager and Zhang (2005), SIAM J. Optim. 16, eq. 4.1, for an energy that rises
-by no more than its round-off.
+A length is accepted by one of two conditions. Far from the solution Armijo's condition decides. Near it differences of
+energy are smaller than their round-off, and the slope decides, by the approximate Wolfe condition of Hager and Zhang
+(2005), SIAM J. Optim. 16, eq. 4.1: it accepts an energy that rises by no more than its round-off.
 """
 
 from __future__ import annotations
@@ -17,18 +17,15 @@ from jax import lax
 from jaxbeam.core.compiling import choose
 from jaxbeam.scene.scene import Evaluation, Scene, evaluate, largest_step
 
-# Share of the decrease along the tangent that Armijo's condition asks for.
+# Armijo's condition asks for this share of the decrease that the slope predicts.
 ARMIJO = 1e-4
-
 
 # The constant delta of the approximate Wolfe condition.
 APPROXIMATE_WOLFE = 0.1
 
-
 MAX_HALVINGS = 40
 
-
-# Round-off of an energy, over eps times the magnitudes that are added up in it.
+# Round-off of an energy, over eps times its `magnitude` in `line_search`.
 ENERGY_ROUND_OFF = 4.0
 
 
@@ -59,20 +56,20 @@ def line_search(
 ) -> SearchResult:
     """Take a step, halved until the energy falls.
 
-    It begins with the largest length, at most 1, at which no element loses more volume than `keep_volume` allows.
+    The first length tried is the largest, up to 1, at which no element loses more volume than `keep_volume` allows.
 
     Args:
-        scene: to be solved.
+        scene: the scene to solve.
         x: `(n, d)` positions.
         evaluation: energy and gradient at `x`.
         step: `(n, d)` the full step.
         initial: `()` whether this step leads to the start of Newton's method. Then `evaluation` is not known yet, and
             the first length is accepted whatever the energy.
         full: `()` whether the energy may rise. Then the first length with a finite energy is accepted.
-        keep_volume: the fraction of its `J` that every element keeps.
+        keep_volume: fraction of its `J` that every element keeps (for exceptions see `largest_step`).
     """
     slope = jnp.sum(evaluation.gradient * step)
-    # Round-off of the energy comes from its sum, and from the positions it is evaluated at.
+    # Round-off of the energy comes from the summation and from the round-off of the positions.
     magnitude = evaluation.energy_scale + jnp.max(jnp.abs(x)) * jnp.sum(evaluation.gradient_scale)
     round_off = ENERGY_ROUND_OFF * jnp.finfo(step.dtype).eps * magnitude
     longest = jnp.minimum(1.0, largest_step(scene, x, step, keep_volume)).astype(step.dtype)

@@ -1,9 +1,9 @@
 """Newton's method for the unknown node positions of one scene, inside jit.
 
 A step solves `K dx = -g`, with the gradient `g` of the energy and a positive definite stiffness `K`
-(`jaxbeam.solve.stiffness`), and is shortened by a line search (`jaxbeam.solve.line_search`). It ends when the relative
-residual (`jaxbeam.solve.residual`) is small. At a solution the Cholesky factor of the true Hessian exists if and only
-if the equilibrium is stable.
+(`jaxbeam.solve.stiffness`), and is shortened by a line search (`jaxbeam.solve.line_search`). The iteration ends when
+the relative residual (`jaxbeam.solve.residual`) is small. At a solution the Cholesky factor of the true Hessian exists
+if and only if the equilibrium is stable.
 """
 
 from __future__ import annotations
@@ -28,30 +28,27 @@ from jaxbeam.solve.line_search import line_search
 from jaxbeam.solve.residual import force_round_off, force_scale, relative_residual
 from jaxbeam.solve.stiffness import Stiffness, factorise, is_singular, zero_factor
 
-# A step shorter than this, over the size of the body, changes the stiffness of the softest mode by as small a share, so
-# its factor may be reused.
+# A step shorter than this, over the size of the body, changes the stiffness of the softest mode by as small a fraction,
+# so the factor may be reused.
 NEAR = 1e-6
-
 
 # A solution is inaccurate if one more step would move a node by more than this, over the size of the body. Up to
 # `POLISH` steps are spent on making it accurate.
 INACCURATE = 1e-3
-
-
 POLISH = 10
 
 
 @dataclasses.dataclass(frozen=True)
 class Newton:
-    """Settings of the equilibrium solver. Hashable: a change compiles anew.
+    """Settings of the equilibrium solver. Hashable; other settings compile the solver anew.
 
-    max_steps: Newton steps before giving up on one equilibrium, all attempts at it together.
+    max_steps: most Newton steps for one equilibrium, all attempts at it together.
     rtol: relative residual to reach; by default 1e-10 in float64 and 1e-6 in float32.
     linear: the linear solver, `BlockTridiagonal()` or, for tiny scenes, `Dense()`.
-    keep_volume: no element falls below this fraction of its `J` in one step. It keeps elements from
-        inverting within a step, and logarithmic energies finite.
-    escape: leave a saddle along its lowest mode for the stable equilibrium beside it. Without it a saddle
-        is returned as it is found, flagged `UNSTABLE`.
+    keep_volume: fraction of its `J` that every element keeps in one step. So no element inverts within a step, and
+        logarithmic energies stay finite. Elements of small `J` are exempt where their energy allows inversion.
+    escape: leave a saddle along a soft mode for the stable equilibrium beside it. If false, the saddle is returned,
+        flagged `UNSTABLE`.
     """
 
     max_steps: int = 2000
@@ -93,19 +90,21 @@ def topology(scene: Scene) -> Topology:
     return Topology(key_of(scene.mesh, "elements"), key_of(scene, "fixed"), nodes)
 
 
-# --------------------------------------------------------------------------------- what the method works with
+# --------------------------------------------------------------------------------- data of the method
 
 
 class Policy(NamedTuple):
-    """What one run of Newton's method may do, and what it computes beside.
+    """What one run of Newton's method is allowed to do, and a second right-hand side that it solves for.
 
-    max_steps: `()` the most steps it may take.
-    full_steps: `()` number of first steps that need not lower the energy while the true Hessian is definite.
-    reuse_factor: `()` whether the last step, if it is shorter than `NEAR`, reuses the factor of the step before. Most
-        intermediate states of a ramp end so, and it saves them half the work. None if never; then it is not traced.
-    leaving_saddle: `()` whether it starts beside a saddle, where shifts are tried before projections.
-    probe: `(x, definite)` to nodal forces `(n, d)` that are solved for beside the unbalanced ones. One right-hand side
-        more costs next to nothing.
+    max_steps: `()` most steps of the run.
+    full_steps: `()` number of first steps that may raise the energy while the true Hessian is positive definite.
+    reuse_factor: `()` whether a state in balance reuses the last factor if the step to it was shorter than `NEAR`. Most
+        intermediate states of a ramp end with such a step, and reuse saves them half the work. None: never, and nothing
+        is traced for it.
+    leaving_saddle: `()` whether the run starts beside a saddle. Then shifts of the stiffness are tried before
+        projections.
+    probe: function `(x, definite)` that returns a second right-hand side `(n, d)` at positions `x`; `definite` `()`
+        tells whether the true Hessian is positive definite there. It costs almost nothing beside the first.
     """
 
     max_steps: jax.Array
@@ -116,12 +115,12 @@ class Policy(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What one run of Newton's method has counted so far, each an int32 `()`.
+    """Counts of one run of Newton's method so far; each an int32 `()`.
 
     steps: steps taken.
     projected: steps taken with a modified stiffness.
     halvings: halvings of the line search, all steps together.
-    polished: steps wanted for accuracy alone, in balance.
+    polished: steps ordered for accuracy alone, in states that are in balance.
     """
 
     steps: jax.Array
@@ -135,14 +134,14 @@ class State(NamedTuple):
 
     x: `(n, d)` positions.
     evaluation: energy and gradient at `x`.
-    stiffness: at `x`; at the start of the last step if its factor was reused.
+    stiffness: stiffness at `x`, or where the last step began if its factor was reused.
     step: `(n, d)` the step to take next.
-    response: `(n, d)` displacement under the forces of the probe, at `x`.
-    correction: `()` largest move of a node in `step`, over the size of the body.
+    response: `(n, d)` solution of `K response = -probe` at `x`.
+    correction: `()` largest component of `step`, over the size of the body.
     singular: `()` whether the lowest eigenvalue of the stiffness is within round-off of zero. Known at the end only.
     residual: `()` relative residual at `x`.
-    counts: what was counted.
-    initial: `()` whether `step` leads to the start of the method; such a step is not counted.
+    counts: counts of the run so far.
+    initial: `()` whether `step` is the displacement to the start of the method, which is not counted as a step.
     running: `()` whether another step is to be taken.
     """
 
@@ -160,13 +159,13 @@ class State(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What does not change during one run.
+    """The inputs of one run, which do not change.
 
-    scene: to be solved, with unlocked indices.
-    layout: of its matrix.
-    policy: what the run may do.
+    scene: the scene to solve, with unlocked indices.
+    layout: layout of the stiffness matrix.
+    policy: what the run is allowed to do.
     solver: settings.
-    size: `()` of the body.
+    size: `()` size of the body.
     """
 
     scene: Scene
@@ -184,18 +183,18 @@ def newton(
 ) -> State:
     """Newton's method from `x + displacement`; to be called inside jit.
 
-    It starts as far along the displacement as no element inverts.
+    If an element would invert on the way there, the method starts at a shorter displacement.
 
     Args:
-        scene: to be solved, with unlocked indices.
-        layout: of its matrix.
+        scene: the scene to solve, with unlocked indices.
+        layout: layout of the stiffness matrix.
         x: `(n, d)` positions without an inverted element.
-        displacement: `(n, d)` from there to the start.
-        policy: what the run may do.
+        displacement: `(n, d)` from `x` to the start.
+        policy: what the run is allowed to do.
         solver: settings.
 
     Returns:
-        The state it ends in. `running` is false; the residual tells whether it converged.
+        The final state. `running` is false; the residual tells whether the method converged.
     """
     problem = Problem(scene, layout, policy, solver, extent(scene))
     begin = init(problem, x, displacement)
@@ -204,7 +203,7 @@ def newton(
 
 
 def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
-    """The state before the initial step, `displacement`: nothing is evaluated yet."""
+    """The state before the initial `displacement` is taken. Nothing is evaluated yet."""
     zero, zeros, yes = jnp.zeros((), x.dtype), jnp.zeros_like(x), jnp.asarray(True)
     none = jnp.zeros((), jnp.int32)
     factor = zero_factor(problem.layout, x.dtype, problem.solver.linear)
@@ -243,8 +242,8 @@ def step(problem: Problem, state: State) -> State:
     residual = relative_residual(scene, evaluation, force_round_off(stiffness.rows, x), rtol)
     next_step, response = _solve(problem, state, x, evaluation, stiffness, reuse)
     correction = jnp.max(jnp.abs(next_step)) / problem.size
-    # In balance, but a step would still move it: rounding keeps the positions from rest along a soft mode, and each
-    # step rounds them anew.
+    # The forces balance, but a step would still move the body: rounding of the positions keeps them off equilibrium
+    # along a soft mode. Each further step rounds them anew.
     polish = (residual <= rtol) & (correction > INACCURATE) & (state.counts.polished < POLISH)
     taken = moved & ~state.initial
     after = State(
@@ -271,12 +270,12 @@ def terminate(problem: Problem, before: State, after: State, balanced: jax.Array
         before: state before the step.
         after: state after it.
         balanced: `()` whether the forces balance to `rtol`, without any allowance for round-off.
-        polish: `()` whether they balance and the positions are still inaccurate.
+        polish: `()` whether the residual is small enough but the positions are still inaccurate.
     """
     rtol = problem.solver.tolerance(after.x.dtype)
-    # Within round-off a step that halves the residual is still worth taking; one that does not is noise.
+    # Within the allowance for round-off go on as long as a step halves the residual. A smaller change is noise.
     improving = ~balanced & (after.residual < 0.5 * before.residual)
-    # False for a residual of NaN: there is nothing to go on from.
+    # False for a residual of NaN, from which no step can be computed.
     wanted = (after.residual > rtol) | improving | polish
     return ~(wanted & (after.counts.steps < problem.policy.max_steps))
 
@@ -285,7 +284,7 @@ def terminate(problem: Problem, before: State, after: State, balanced: jax.Array
 
 
 def _reuse(problem: Problem, state: State, balanced: jax.Array) -> tuple[jax.Array | bool, jax.Array | bool]:
-    """Whether the factor of the step before is reused, and whether a new one is made; plain booleans if never."""
+    """Whether to reuse the last factor, and whether to make a new one; plain booleans if it may never be reused."""
     if problem.policy.reuse_factor is None:
         return False, True
     short = ~state.initial & (jnp.max(jnp.abs(state.step)) <= NEAR * problem.size)
@@ -309,10 +308,10 @@ def _solve(
     """
 
     def refinement(x: jax.Array, response: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Forces that the response found last leaves unbalanced at `x`, beside those of the probe."""
+        """The stiffness at `x` times the last response, and that response."""
         return jax.jvp(lambda x: evaluate(problem.scene, x).gradient, (x,), (response,))[1], response
 
-    # With a reused factor, refine the response by one residual correction instead of finding it anew.
+    # With a reused factor, refine the last response by one residual correction instead of solving for it anew.
     zeros = jnp.zeros_like(x)
     left, response = compute_if(reuse, refinement, (zeros, zeros), x, state.response)
     probe = problem.policy.probe(x, stiffness.definite)
@@ -324,7 +323,14 @@ def _solve(
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:
-    """The counts after a step: whether it was `taken`, its `halvings`, and whether the next one is to `polish`."""
+    """The counts after a step.
+
+    Args:
+        state: state before the step.
+        taken: `()` whether the step was taken.
+        halvings: `()` how often the line search halved it.
+        polish: `()` whether the next step is for accuracy alone.
+    """
     counts, one = state.counts, lambda condition: condition.astype(jnp.int32)
     return Counts(
         steps=counts.steps + one(taken),

@@ -1,9 +1,9 @@
-"""The predictor: where the next equilibrium on a branch lies, from the last few and their tangents.
+"""The predictor: it extrapolates to the next equilibrium on a branch from the last few and their tangents.
 
 It evaluates the polynomial that interpolates positions and slopes of these states: Hermite's interpolation, in
-Lagrange's form (Stoer and Bulirsch 2002, section 2.1.5). With `q` states its error is of order `2 q` in the spacing,
-where that of the tangent is of order 2. On the ramp of the reference scene this is 1e-7 of the body's length instead of
-1e-2, and one Newton step is left where there were three.
+Lagrange's form (Stoer and Bulirsch 2002, section 2.1.5). With `q` states its error is of order `2 q` in the spacing;
+that of the tangent is of order 2. On the ramp of the reference scene the error is 1e-7 of the body's length instead of
+1e-2, and Newton's method takes one step instead of three.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import jax.numpy as jnp
 # Number of states that are stored.
 STATES = 4
 
-
-# The prediction may differ from the tangent's, and the solution from the prediction, by this much over the length of
-# the step. Beyond it the stored states are no guide: the branch turns, or the beam has snapped to another one.
+# Largest allowed difference between the polynomial's prediction and the tangent's, and between solution and prediction,
+# over the length of the step. If it is larger the stored states are of no use: the branch turns, or the beam has
+# snapped to another one.
 TRUST = 0.25
 
 
@@ -26,9 +26,9 @@ class Trail(NamedTuple):
     """The last states on a branch, newest first.
 
     s: `(q,)` parameters.
-    x: `(q, n, d)` positions. That of the newest is always known.
+    x: `(q, n, d)` positions; those of the newest state are always known.
     slope: `(q, n, d)` derivatives of the positions in `s`.
-    depth: `()` int32, how many of them, from the newest on, have a known slope.
+    depth: `()` int32, number of states, counted from the newest, that are known with their slope.
     """
 
     s: jax.Array
@@ -53,7 +53,7 @@ def start_trail(x: jax.Array, slope: jax.Array | None = None) -> Trail:
 def predict(trail: Trail, s: jax.Array) -> jax.Array:
     """Predicted displacement `(n, d)` from the newest state to the one at `s`; zero while no slope is known.
 
-    It is that of the interpolating polynomial, or along the tangent where these differ by more than `TRUST`.
+    The interpolating polynomial gives it, or the tangent if the two differ by more than `TRUST`.
     """
     known = jnp.arange(STATES, dtype=jnp.int32) < trail.depth
     other = known[:, None] & known & ~jnp.eye(STATES, dtype=bool)
@@ -77,7 +77,7 @@ def extend(trail: Trail, s: jax.Array, x: jax.Array, slope: jax.Array, predicted
         s: `()` parameter of the new state.
         x: `(n, d)` its positions.
         slope: `(n, d)` their derivative in `s`.
-        predicted: `(n, d)` displacement from the newest state that was predicted.
+        predicted: `(n, d)` the displacement from the newest state of `trail` that had been predicted.
         known: `()` whether the slope is known.
     """
     on_branch = known & _close(x - trail.x[0], predicted, predicted)

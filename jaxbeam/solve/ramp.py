@@ -1,4 +1,4 @@
-"""Actuation: a command approached step by step."""
+"""Ramps: a command is approached from rest in even steps."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def commands(ratios: Numbers, steps: int = 28, start: Numbers | None = None) -> 
     """The commands `(steps, m)` of a ramp: evenly spaced from `start` to `ratios` `(m,)`.
 
     Args:
-        ratios: the last command.
-        steps: how many commands, at least 2.
-        start: the first command, `()` or `(m,)`; by default ratio 1, the rest of tendons.
+        ratios: `(m,)` the last command.
+        steps: number of commands, at least 2.
+        start: `()` or `(m,)` the first command; by default ratio 1, at which tendons are at rest.
 
     Raises:
         ValueError: if `steps` is not a whole number of at least 2, or a concrete ratio is not positive and finite (not
@@ -43,7 +43,7 @@ def commands(ratios: Numbers, steps: int = 28, start: Numbers | None = None) -> 
     end = end if end.dtype.kind == "f" else end.astype(jnp.result_type(float))
     first = np.ones((), end.dtype) if start is None else checks.numbers("start", start, shapes=((), end.shape))
     way = np.linspace(0.0, 1.0, steps).astype(end.dtype)[:, None]
-    # Weighted, not start + way * (end - start), so that the last command is `ratios` to the last bit.
+    # A weighted sum instead of start + way * (end - start), so that the last command is `ratios` to the last bit.
     return to_device((1 - way) * first.astype(end.dtype) + way * end)
 
 
@@ -51,16 +51,16 @@ def commands(ratios: Numbers, steps: int = 28, start: Numbers | None = None) -> 
 def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton()) -> Solution:
     """Equilibria on the way from rest to the command `ratios`, each started from the one before.
 
-    What a beam does when its tendons are pulled slowly: where an equilibrium depends on the path, this is
-    the one a user sees. Each start is predicted from the states before and their tangents.
+    This is what a beam does when its tendons are pulled slowly: where a command has several equilibria, a ramp finds
+    the one that is reached on this path. Each start is predicted from the states before it and their tangents.
 
-    The last state is judged by its own stiffness. One on the way, if it is one last step of less than a millionth of
-    the body from where its Newton's method began, is judged by the stiffness there.
+    The stability of the last state is decided by the stiffness at that state. For an intermediate state, the stiffness
+    where its last Newton step began may decide, if that step was shorter than a millionth of the body.
 
     Args:
         scene: with `m` tendons.
-        ratios: `(m,)` at the end, positive.
-        steps: how many commands to solve, `commands(ratios, steps)`: the first at ratio 1; at least 2.
+        ratios: `(m,)` commands at the end, positive.
+        steps: number of commands to solve, at least 2: evenly spaced as by `commands`, the first at rest.
         solver: settings of each solve.
 
     Returns:
@@ -82,6 +82,7 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
 
 @compiled("steps", "solver")
 def _ramp(scene: Scene, layout: Layout, end: jax.Array, steps: int, solver: Newton) -> Solution:
+    """The solutions, with leading axis `steps`, on the way from rest to the commands `end` `(m,)`."""
     targets = jnp.linspace(0.0, 1.0, steps, dtype=end.dtype)
     rest = rest_commands(scene)
     return follow(

@@ -1,7 +1,7 @@
-"""What a continuation reports of each target, while it runs.
+"""Reports: what a continuation has found at each target, while it runs.
 
-It becomes a `Solution` at the end. Until then it is packed in few arrays, because a loop that carries many compiles
-slowly. Only `pack` and `unpack` know the order of the entries.
+They become a `Solution` at the end. Until then they are packed in few arrays, because a loop that carries many arrays
+compiles slowly. Only `pack` and `unpack` know the order of the entries.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import jax.numpy as jnp
 
 
 class Report(NamedTuple):
-    """What is reported of one target: fields of `Solution`, each `()`, but `x` `(n, d)`.
+    """What is found at one target. Fields are as in `Solution`; `x` is `(n, d)`, every other one `()`.
 
-    Steps, projected, halvings and attempts are those of all attempts at the target together.
+    `steps`, `projected`, `halvings` and `attempts` are totals over all attempts at the target.
     """
 
     x: jax.Array
@@ -33,13 +33,11 @@ class Report(NamedTuple):
 
 
 FLOATS = ("energy", "residual", "correction", "smallest_jacobian", "reached")
-
-
 INTEGERS = ("steps", "projected", "halvings", "attempts", "worst_element", "status")
 
 
 class PackedReport(NamedTuple):
-    """A `Report` in three arrays, which make a smaller program than twelve: it compiles faster.
+    """A `Report` in three arrays instead of twelve: the program is smaller and compiles faster.
 
     x: `(n, d)` positions.
     floats: `(5,)` in the order of `FLOATS`.
@@ -59,7 +57,7 @@ def pack(report: Report) -> PackedReport:
 
 
 def unpack(packed: PackedReport) -> Report:
-    """The report that was packed; leading axes are kept."""
+    """The report from its packed form; leading axes are kept."""
     floats = {name: packed.floats[..., k] for k, name in enumerate(FLOATS)}
     integers = {name: packed.integers[..., k] for k, name in enumerate(INTEGERS)}
     return Report(x=packed.x, **floats, **integers)

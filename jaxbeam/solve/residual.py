@@ -1,4 +1,4 @@
-"""The relative residual: how far forces are from balance.
+"""The relative residual: how far the forces are from balance.
 
 It is the largest unbalanced force on a free coordinate, divided by the *force scale*: the largest sum of the
 magnitudes of the stencil forces that meet at a free coordinate. A change of units does not change it. A force smaller
@@ -17,7 +17,8 @@ from jaxbeam.scene.scene import Evaluation, Scene
 # Round-off of the force at a coordinate, over `eps max|x|` times the sum of the magnitudes in its row of the stiffness.
 # Measured: below 0.53 for triangles of three and six nodes, all materials and stiffnesses, and slender beams.
 FORCE_ROUND_OFF = 0.75
-# Taken to be more than any sum of the magnitudes in a row, over the largest diagonal entry. Measured: 2 to 4 on meshes
+
+# Assumed upper bound of the sum of the magnitudes in a row, over the largest diagonal entry. Measured: 2 to 4 on meshes
 # of all kinds, up to 10 beside wide anchors.
 LONGEST_ROW = 100.0
 
@@ -31,24 +32,26 @@ def row_magnitudes(scene: Scene, hessians: list[jax.Array]) -> jax.Array:
     """Sum of magnitudes in each row of the stiffness, `(n, d)`, added up stencil by stencil.
 
     Args:
-        scene: whose terms the Hessians belong to.
+        scene: the scene to whose terms the Hessians belong.
         hessians: `(k d, k d, m)` stencil Hessians of each term.
     """
     n, d = scene.mesh.nodes.shape
     total = jnp.zeros((n, d), scene.mesh.nodes.dtype)
     for term, hessian in zip(scene.terms, hessians, strict=True):
-        # Added up by hand: XLA passes a sum to a library whose call takes longer than the sum.
+        # Written as single additions: for `jnp.sum` XLA calls a library, and the call takes longer than the additions.
         rows = functools.reduce(jnp.add, jnp.abs(hessian.swapaxes(0, 1))).reshape(-1, d, hessian.shape[-1])
         total = total.at[term.nodes].add(jnp.moveaxis(rows, -1, 0))
     return total
 
 
 def rows_may_decide(unbalanced: jax.Array, allowed: jax.Array, largest: jax.Array, x: jax.Array) -> jax.Array:
-    """Whether the round-off of forces may decide that a state is balanced, `()`. If not, its rows need not be summed.
+    """Whether the round-off of forces may decide if a state counts as balanced, `()`.
+
+    If not, `row_magnitudes` need not be computed.
 
     Args:
         unbalanced: `()` the largest unbalanced force.
-        allowed: `()` what may be unbalanced without any allowance for round-off.
+        allowed: `()` the largest unbalanced force that is tolerated without any allowance for round-off.
         largest: `()` the largest diagonal entry of the stiffness.
         x: `(n, d)` positions.
     """
@@ -76,13 +79,13 @@ def relative_residual(scene: Scene, evaluation: Evaluation, round_off: jax.Array
     no larger than its round-off pass the test `residual <= rtol`.
 
     Args:
-        scene: to be solved.
+        scene: the scene to solve.
         evaluation: its energy and gradient.
         round_off: `(n, d)` from `force_round_off`.
         rtol: the relative residual to reach.
     """
     scale = force_scale(scene, evaluation) + round_off / rtol
-    # A coordinate on which nothing pulls is in balance.
+    # A coordinate on which no force acts is in balance.
     return jnp.max(
         jnp.where(scene.fixed | (scale == 0), 0, jnp.abs(evaluation.gradient) / jnp.where(scale == 0, 1, scale))
     )

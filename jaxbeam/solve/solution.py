@@ -61,22 +61,23 @@ class EquilibriumError(RuntimeError):
 class Solution:
     """An equilibrium, and how far to trust it. `ramp` and `sweep` return one with a leading axis.
 
-    x: `(n, 2)` node positions.
+    x: `(n, d)` node positions.
     energy: `()` total energy.
     residual: `()` largest unbalanced force on a free coordinate, over the force scale.
     tolerance: `()` the residual that had to be reached.
-    correction: `()` the most that one further Newton step would move a node, over the size of the body: how far
-        round-off leaves `x` from the equilibrium, along its softest directions.
+    correction: `()` the most that one further Newton step would move a node, over the size of the body. It estimates
+        how far round-off leaves `x` from the equilibrium, along the softest directions.
     steps: `()` Newton steps taken, all attempts together.
     projected: `()` how many of them used a modified Hessian.
     halvings: `()` halvings of the line search, all steps together.
     attempts: `()` Newton solves; more than 1 when the first failed or ended on a saddle.
-    smallest_jacobian: `()` smallest `J = det F` anywhere in the solids; infinite without one.
-    worst_element: `()` number of the element where it is smallest.
+    smallest_jacobian: `()` smallest `J = det F` anywhere in the solids, or stretch of a fibre of the rods; infinite
+        without either.
+    worst_element: `()` number of the element where that is; -1 without either.
     crossing: `(2, 2)` int32, two edges of the surface that cross, each by the numbers of its end nodes; -1 if none do.
     ratios: `(m,)` commanded ratio of each tendon.
-    reached: `()` 1 at the command itself. Less if the way to it broke off: then `x` is the equilibrium at that fraction
-        of the way.
+    reached: `()` fraction of the way to the command that was covered: 1 at the command itself. If it is less, `x` is
+        the equilibrium at that fraction of the way.
     status: `()` int32 of or-ed `Status` flags; 0 is `OK`.
     """
 

@@ -1,8 +1,8 @@
 """The tangent stiffness as Newton's method uses it: a positive definite Cholesky factor.
 
-The factor of the true Hessian is taken whenever it exists. Where it does not, the Hessian is blended with a projected
-one (`jaxbeam.physics.projection`) or shifted along its diagonal, by as little as will do: always projecting would make
-convergence linear, and a fully projected Hessian is far too stiff along the soft modes of a snap.
+The factor of the true Hessian is used whenever it exists. Otherwise the Hessian is blended with a projected one
+(`jaxbeam.physics.projection`) or its diagonal is shifted, by about as little as makes it positive definite. To project
+always would make convergence linear, and a fully projected Hessian is far too stiff along the soft modes of a snap.
 """
 
 from __future__ import annotations
@@ -23,46 +23,46 @@ from jaxbeam.solve.residual import row_magnitudes, rows_may_decide
 # Pivots of a singular stiffness come out at 0.1 to 2.8 eps sqrt(N) times the diagonal on bodies that float free, and at
 # 2.7 and more on slender beams in float32. The sign of a pivot below this many eps sqrt(N) is unknown.
 PIVOT_ROUND_OFF = 2.0
+
 # The sign of an eigenvalue is unknown if it is below this many eps times the largest diagonal entry.
 SINGULAR = 2.0
-# Rounding far from the origin strains stiff elements, and the tension of these stiffens or softens the body across
-# them. The sign of an eigenvalue is unknown too below this many times `eps max|x| / size` times the largest diagonal
-# entry. Measured on rods and beams in float32, up to 3,000 lengths from the origin, by the longest row, which in rods
-# is 3 times that entry: every state that was more than 2e-3 of the body from its equilibrium was below 0.1 times the
-# row, and every one above 0.3 times it within 1.1e-3.
+
+# Far from the origin the rounding of positions strains stiff elements, and the tension in these stiffens or softens the
+# body across them. So the sign of an eigenvalue is unknown too if it is below this many `eps max|x| / size` times the
+# largest diagonal entry. Measured on rods and beams in float32, up to 3,000 lengths from the origin, in units of
+# `eps max|x| / size` times the longest row, which in rods is 3 times that entry: every state more than 2e-3 of the body
+# from its equilibrium was below 0.1, and every state above 0.3 was within 1.1e-3.
 FAR = 0.4
-# A matrix whose lowest eigenvalue is the share `t` of its largest diagonal entry has a pivot of less than 1,800 sqrt(t)
-# times that entry. Measured by the longest row, of 2 to 3 times the entry, with `t` from 1e-15 to 1e-3 on beams and
-# rods held in five ways, also with elements a million times softer than others. So the eigenvalue is looked for only
-# where a pivot is less than this many times sqrt(t).
+
+# If the lowest eigenvalue of a matrix is `t` times its largest diagonal entry, a pivot is less than 1,800 sqrt(t)
+# times that entry. Measured with the longest row, of 2 to 3 times the entry, for `t` from 1e-15 to 1e-3, on beams and
+# rods held in five ways, also with elements a million times softer than others. So the lowest eigenvalue is computed
+# only if the smallest pivot is less than this many sqrt(t) times the entry.
 SOFT_PIVOT = 1e4
 
-
-# Share of the projected Hessian that is tried first; it is tripled until it is one. Then shifts are added, each ten
-# times the one before.
+# Share of the projected Hessian in the first blend. It is tripled until it is one. Then shifts are added, each ten
+# times the one before. `MAX_BLENDS` of these modifications are tried.
 FIRST_SHARE = 0.01
-
-
 MAX_BLENDS = 16
 
-
-# Near a bifurcation the negative eigenvalue is tiny, and the smallest projected share would be thousands of times as
-# stiff. So on the way from a saddle this many shifts are tried before any projection, each ten times the one before:
-# from ten times the round-off of a pivot to about a millionth of the stiffness, where the lowest eigenvalues of a beam
-# lie.
+# Near a bifurcation the negative eigenvalue is tiny, and even the first blend would be thousands of times as stiff. So
+# when leaving a saddle this many shifts are tried before any blend, each ten times the one before. They go from ten
+# times the round-off of a pivot to about a millionth of the stiffness, where the lowest eigenvalues of a beam lie.
 GENTLE_SHIFTS = 8
 
 
 class Stiffness(NamedTuple):
-    """The tangent stiffness, factored.
+    """The tangent stiffness, factorised.
 
     factor: positive definite Cholesky factor: of the true Hessian if `definite`, else of a modified one.
     definite: `()` whether the true Hessian is positive definite.
-    marginal: `()` whether round-off of the factor decided that, so that its sign is unknown.
-    near_zero: `()` whether it is not, and becomes so when shifted by round-off, or by `far_share`.
+    marginal: `()` whether round-off of the factor decided `definite`, so that stability is unknown.
+    near_zero: `()` whether the true Hessian is not positive definite, but becomes so when its diagonal is shifted by
+        round-off or by `far_share`.
     pivot: `()` the smallest pivot of the factor.
     largest: `()` the largest magnitude on the diagonal of the true Hessian.
-    rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`; zero where they decide nothing.
+    rows: `(n, d)` sums of magnitudes in each row, from `row_magnitudes`; zero if they are not needed (see
+        `rows_may_decide`).
     """
 
     factor: Any
@@ -75,13 +75,13 @@ class Stiffness(NamedTuple):
 
 
 def zero_factor(layout: Layout, dtype: Any, linear: LinearSolver) -> Any:
-    """Zeros in the shape of a factor: a value to start a loop with."""
+    """A factor of zeros, the initial value of a loop."""
     storage = jax.ShapeDtypeStruct(layout.empty.shape, dtype)
     return zeros_like_result(linear.factor, layout, storage)[0]
 
 
 def largest_diagonal(layout: Layout, storage: jax.Array) -> jax.Array:
-    """The largest magnitude on the diagonal of a matrix, padding apart, `()`."""
+    """The largest magnitude on the diagonal of a matrix, without its padding, `()`."""
     unknown = layout.slots < layout.position.size
     return jnp.max(jnp.where(unknown, jnp.abs(storage[layout.diagonal]), 0))
 
@@ -100,16 +100,16 @@ def factorise(
     """The stiffness at `x`, with a positive definite factor.
 
     The matrices tried are, in this order: the true Hessian; the true Hessian shifted by round-off, or far from the
-    origin by `far_share`; when leaving a saddle, larger shifts; blends with the projected Hessian, with a growing
-    share; the projected Hessian, shifted.
+    origin by `far_share`; when leaving a saddle, the true Hessian with larger shifts; blends with the projected
+    Hessian, with a growing share; the projected Hessian, shifted.
 
     Args:
-        scene: to be solved.
-        layout: of its matrix.
+        scene: the scene to solve.
+        layout: layout of the matrix.
         x: `(n, d)` positions.
-        size: `()` of the body.
-        unbalanced: `()` the largest unbalanced force there. If it is not finite, one factorisation is tried, no more.
-        allowed: `()` what may be unbalanced without any allowance for round-off.
+        size: `()` size of the body.
+        unbalanced: `()` the largest unbalanced force at `x`. If it is not finite, only one factorisation is tried.
+        allowed: `()` the largest unbalanced force that is tolerated without any allowance for round-off.
         leaving_saddle: `()` whether shifts are tried before projections.
         linear: the linear solver.
     """
@@ -144,11 +144,13 @@ def factorise(
 
 
 def far_share(x: jax.Array, size: jax.Array) -> jax.Array:
-    """The share `()` of the largest diagonal entry below which distance from the origin hides an eigenvalue's sign.
+    """Bound of eigenvalues whose sign is unknown because the body is far from the origin (see `FAR`).
+
+    It is given as a share `()` of the largest diagonal entry.
 
     Args:
         x: `(n, d)` positions.
-        size: `()` of the body.
+        size: `()` size of the body.
     """
     return FAR * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x)) / size
 
@@ -159,11 +161,11 @@ def is_singular(
     """Whether the sign of the lowest eigenvalue of a stiffness is unknown, `()`: by round-off or by `far_share`.
 
     Args:
-        scene: it belongs to.
-        layout: of its matrix.
+        scene: the scene of the stiffness.
+        layout: layout of the matrix.
         x: `(n, d)` positions.
-        size: `()` of the body.
-        stiffness: at `x`.
+        size: `()` size of the body.
+        stiffness: stiffness at `x`.
         linear: the linear solver.
     """
     signs = jnp.asarray(np.random.default_rng(1).choice([-1.0, 1.0], x.shape), x.dtype)
@@ -184,7 +186,13 @@ def is_singular(
 def _modification(
     tries: jax.Array, first_blend: jax.Array, round_off: float, unknown: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """How the matrix is modified after so many failed tries: first by the share of the diagonal that is `unknown`.
+    """How the matrix is modified after `tries` `()` failed factorisations (order as in `factorise`).
+
+    Args:
+        tries: `()` number of failed factorisations.
+        first_blend: `()` number of failed factorisations before the first blend.
+        round_off: round-off of a pivot, over the diagonal entry.
+        unknown: `()` the first shift, over the largest diagonal entry.
 
     Returns:
         The share `()` of the projected Hessian, and the shift `()` of the diagonal over its largest entry.

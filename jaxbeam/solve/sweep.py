@@ -1,10 +1,10 @@
-"""Many commands at once.
+"""Sweeps: the equilibria of many commands.
 
 Neighbouring commands have similar equilibria. So each command is continued from the nearest one that is solved already,
-with its tangent as predictor (`jaxbeam.solve.predictor`). This takes one or two Newton steps, where a solve from rest
+with the tangent there as predictor (`jaxbeam.solve.predictor`). This takes one or two Newton steps; a solve from rest
 takes ten or twenty.
 
-Commands are divided into chunks of near ones, by a rule that depends on the commands and the scene alone. One compiled
+Commands are divided into chunks of neighbours, by a rule that depends on the commands and the scene alone. One compiled
 program solves a chunk of any number of commands, from rest outward. Chunks are independent: they run on all cores,
 devices and processes, in any order, with the same results.
 """
@@ -38,15 +38,12 @@ from jaxbeam.solve.solution import Solution, Status
 # The most commands in a chunk.
 CHUNK = 128
 
-
 # The most numbers in the positions and tangents of a chunk: half a gigabyte in float64.
 MEMORY = 1 << 26
-
 
 # The least distance (in ratios) between states that a prediction is made from. A polynomial through nearer ones
 # amplifies their round-off, and that costs a Newton step.
 GAP = 0.005
-
 
 # Two directions count as one if the square of the sine of the angle between them is below this.
 STRAIGHT = 1e-12
@@ -61,22 +58,23 @@ def sweep(
 ) -> Solution:
     """The equilibrium of each of many commands.
 
-    Each command is continued from the nearest one that is closer to rest and solved already; if that fails, it is
-    solved from rest. Where a command has several equilibria, this finds the one that a beam reaches when its tendons
-    are shortened monotonically; `ramp` follows a path of your own. A command that fails does not affect the others.
+    Each command is continued from the nearest one that is closer to rest and solved already. If that fails, it is
+    solved from rest. Where a command has several equilibria, the sweep finds the one that a beam reaches when its
+    tendons are shortened monotonically; `ramp` follows the straight path to one command. A command that fails does not
+    affect the others.
 
-    It runs on all cores of all local devices. Under `jax.distributed` every process calls it with the same arguments,
-    solves a part of the commands, and gets all results. These do not depend on the number of processes.
+    A sweep runs on all cores of all local devices. Under `jax.distributed` every process calls `sweep` with the same
+    arguments, solves a part of the commands, and gets all results. These do not depend on the number of processes.
 
     Args:
         scene: with `m` tendons.
         ratios: `(B, m)`, positive.
         solver: settings of each solve.
-        progress: called as `progress(solved, all)` after each chunk, with numbers of this process's commands. Not
-            called inside jit.
+        progress: called as `progress(solved, all)` after each chunk, with the number of commands that this process
+            has solved and the number of all its commands. Not called inside jit.
 
     Returns:
-        A `Solution` with leading axis `B`. Each command's is differentiable as that of `equilibrium` is.
+        A `Solution` with leading axis `B`, differentiable like that of `equilibrium`.
 
     Raises:
         ValueError: if the shape is wrong, a concrete ratio is not positive and finite, or as `equilibrium` does.
@@ -104,14 +102,14 @@ def sweep(
 
 
 class Chunk(NamedTuple):
-    """What is known of a chunk of `C` commands: one entry each, and a last one, with index `C`, for the beam at rest.
+    """States of a chunk of `C` commands: an entry for each command, and one with index `C` for the beam at rest.
 
     ratios: `(C + 1, m)` commands.
-    loaded: `(C + 1,)` share of the dead loads: 0 at rest, 1 elsewhere.
-    x: `(C + 1, n, d)` positions, with the last correction added (see `Continuation.trail`).
+    loaded: `(C + 1,)` share of the loads that acts: 0 at rest, 1 elsewhere.
+    x: `(C + 1, n, d)` positions, with the last Newton step added (see `Continuation.accepted`).
     tangent: `(C + 1, m, n, d)` derivative of the positions in each ratio.
-    usable: `(C + 1,)` whether others may be continued from it.
-    known: `(C + 1,)` whether its tangent is known.
+    usable: `(C + 1,)` whether other commands may be continued from the entry.
+    known: `(C + 1,)` whether the tangent is known.
     previous: `(C + 1,)` index of an entry closer to rest on the same smooth branch; `C` if there is none.
     """
 
@@ -125,13 +123,13 @@ class Chunk(NamedTuple):
 
 
 class Continued(NamedTuple):
-    """What is found for one command.
+    """The result for one command.
 
     solution: its solution.
-    x: `(n, d)` positions, with the last correction added.
+    x: `(n, d)` positions, with the last Newton step added.
     tangent: `(m, n, d)` derivative of the positions in each ratio.
     known: `()` whether the tangent is known.
-    joined: `()` whether it lies on the same smooth branch as the entry it was continued from.
+    joined: `()` whether the solution lies on the same smooth branch as the entry that it was continued from.
     """
 
     solution: Solution
@@ -168,7 +166,7 @@ def solve_chunk(scene: Scene, layout: Layout, rows: jax.Array, count: jax.Array,
         def attempt(carry: Any) -> Any:
             parent, _, _ = carry
             found = _continue(scene, layout, chunk, index, parent, solver)
-            # One that fails is tried again from rest.
+            # A command that fails is tried again from rest.
             again = ~_is_good(found.solution) & (parent != size)
             return jnp.where(again, size, parent), again, found
 
@@ -198,12 +196,12 @@ def _at_rest(scene: Scene, rows: jax.Array) -> Chunk:
 
 
 def _is_good(solution: Solution) -> jax.Array:
-    """Whether others may be continued from a solution, `()`. A body that overlaps itself is an equilibrium too."""
+    """Whether other commands may be continued from a solution, `()`. One that overlaps itself is an equilibrium too."""
     return (solution.status & ~Status.OVERLAPPING) == 0
 
 
 def _entered(chunk: Chunk, index: jax.Array, parent: jax.Array, found: Continued) -> Chunk:
-    """The chunk with what was found for the command with this index, continued from the entry `parent` `()`."""
+    """The chunk with the result of the command `index` `()`, which was continued from the entry `parent` `()`."""
     good, size = _is_good(found.solution), len(chunk.ratios) - 1
     before = chunk.previous[parent]
     # The parent is skipped if it is too near to the entry before it.
@@ -221,7 +219,7 @@ def _entered(chunk: Chunk, index: jax.Array, parent: jax.Array, found: Continued
 def _continue(
     scene: Scene, layout: Layout, chunk: Chunk, index: jax.Array, parent: jax.Array, solver: Newton
 ) -> Continued:
-    """The equilibrium of the command with this index, continued from the entry `parent`."""
+    """The equilibrium of the command `index` `()`, continued from the entry `parent` `()`."""
     ratios, start = chunk.ratios[index], chunk.ratios[parent]
     loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * start + s * ratios)
@@ -239,10 +237,10 @@ def _continue(
 
 
 def _nearest(chunk: Chunk, ratios: jax.Array) -> jax.Array:
-    """Index `()` of the entry to continue from: the nearest usable one.
+    """Index `()` of the entry that the command `ratios` `(m,)` is continued from: the nearest usable one.
 
-    The distance of an entry counts half if its previous one lies on the same line to `ratios` `(m,)`: then the
-    predictor has two states.
+    The distance of an entry counts half if its previous entry lies behind it on the line to `ratios`, because the
+    predictor has two states then.
     """
     onward, back = ratios - chunk.ratios, chunk.ratios - chunk.ratios[chunk.previous]
     distance, along = jnp.sum(onward**2, axis=1), jnp.sum(onward * back, axis=1)
@@ -253,7 +251,10 @@ def _nearest(chunk: Chunk, ratios: jax.Array) -> jax.Array:
 
 
 def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
-    """The trail of the parent, at `s = 0`, and its previous entries, as long as they lie on the line to `ratios`."""
+    """The trail from the entry `parent` `()`, at `s = 0`, to the command `ratios` `(m,)`, at `s = 1`.
+
+    Behind the parent come its previous entries, up to the first that does not lie on the line to `ratios`.
+    """
     direction = ratios - chunk.ratios[parent]
     length = jnp.sum(direction**2)
     entries, s, fits = [parent], [jnp.zeros((), ratios.dtype)], [chunk.known[parent]]
@@ -262,7 +263,8 @@ def _trail(chunk: Chunk, parent: jax.Array, ratios: jax.Array) -> Trail:
         back = chunk.ratios[entry] - chunk.ratios[parent]
         along = jnp.sum(back * direction) / jnp.where(length > 0, length, 1)
         across = jnp.sum((back - along * direction) ** 2)
-        # Farther back by a hundredth of the step at least, or the polynomial through both is ill-conditioned.
+        # Each entry must lie at least a hundredth of the step behind the one before, or the polynomial through both is
+        # ill-conditioned.
         behind = along < s[-1] - 0.01
         fits.append(fits[-1] & chunk.known[entry] & behind & (across <= STRAIGHT * length))
         entries.append(entry)
@@ -317,7 +319,8 @@ def _on_all_cores(
     """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
     parts = _partition(rows, np.arange(len(rows)), size)
     processes, devices = jax.process_count(), tuple(jax.local_devices())
-    # All processes must take part: with fewer parts than processes, one that has none solves the first again.
+    # All processes must take part. If there are fewer parts than processes, a process without one solves the first part
+    # again.
     mine = parts[jax.process_index() :: processes] or parts[:1]
     jobs = [mine[k : k + len(devices)] for k in range(0, len(mine), len(devices))]
 
@@ -329,8 +332,8 @@ def _on_all_cores(
         return [jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(job))]
 
     results: list[Solution] = []
-    # Several devices solve the chunks of one job together. To JAX the cores of a processor are one device: each gets a
-    # thread, which solves one job after the other.
+    # Several devices solve the chunks of one job together. To JAX the cores of a processor are a single device. There
+    # each core gets a thread, which solves one job after the other.
     workers = (os.cpu_count() or 1) if len(devices) == 1 and devices[0].platform == "cpu" else 1
     if len(jobs) > 1:
         # An empty job compiles the program once; otherwise each thread would compile it.
@@ -365,12 +368,12 @@ def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
 
 
 def _partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndarray]:
-    """Divide commands into groups of at most `size` near ones, by halving the widest coordinate until they fit.
+    """Divide commands into groups of at most `size` neighbours, by halving along the widest coordinate until they fit.
 
     Args:
         rows: `(B, m)` commands.
-        indices: of those to divide.
-        size: the most in a group.
+        indices: indices of the commands to divide.
+        size: the most commands in a group.
     """
     if len(indices) <= size:
         return [indices]

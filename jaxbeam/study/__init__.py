@@ -1,1 +1,1 @@
-"""What is asked of equilibria: stability, branches, errors, inverse design."""
+"""Studies of equilibria: stability, branches, error estimates, inverse design."""

@@ -1,15 +1,15 @@
-"""How wrong an answer is: the error that the mesh leaves in a measure, and an answer as exact as is asked for.
+"""The discretisation error of a measure, and refinement until the error is below a tolerance.
 
-The solution of a scene is carried over to a finer mesh that contains it (triangles of six nodes in the place of three;
-four triangles in the place of one that has six). There it is not in balance. The forces `g` that are left, weighted by
-the adjoint `z` of the measure `M`,
+The solution of a scene is carried over to a finer mesh that contains it. There triangles of six nodes replace those of
+three, and four triangles replace each one of six nodes. On the finer mesh the solution is not in balance. The
+unbalanced forces `g`, weighted by the adjoint `z` of the measure `M`,
 
     K z = dM/dx,     M(finer) - M(coarse) = -z . g + ...,
 
-tell what the finer mesh would change (the dual-weighted residual method: Becker and Rannacher, Acta Numerica 10, 2001,
-1-102). Where that is so much that the first order does not do, it is repeated from where it leads. The finer mesh is
-not the continuum either, so the change is scaled up by what is left after it; by how much is measured
-(`benchmarks/accuracy.py`).
+estimate by how much the finer mesh changes the measure (the dual-weighted residual method: Becker and Rannacher, Acta
+Numerica 10, 2001, 1-102). If the change is too large for the first order, the estimate is repeated after a Newton step.
+The finer mesh has an error too, so the change is multiplied by `Element.shortfall`: the ratio of the true error to the
+change, measured by `benchmarks/accuracy.py`.
 """
 
 from __future__ import annotations
@@ -39,35 +39,29 @@ from jaxbeam.solve.solution import Solution
 Measure = Callable[[Scene, jax.Array], jax.Array]
 
 
-# What the estimate is multiplied by to bound the error.
+# Safety factor: the error bar over the estimated error.
 SAFETY = 1.5
-
-
-# Share added of what cancels: parts of the error that have opposite signs do not shrink alike.
+# Share of the parts of the estimate that cancel, added to the bar: parts of opposite sign need not shrink alike.
 UNLIKE = 0.25
-
-
-# The estimate is repeated from where it leads until it changes by less than this share of it.
+# The estimate is repeated, each time after a Newton step, until that step changes the measure by at most this share of
+# the whole change, but not more than `MOST_STEPS` times.
 SETTLED = 0.1
-
-
 MOST_STEPS = 6
-
-
-# A factor serves the next step too after one under this share of the body, and by so much shorter than the one before.
+# Reuse the factor if the last step was below `SMALL` times the body and below `SHRINKING` times the one before.
 SMALL = 0.01
-
-
 SHRINKING = 0.3
 
 
 class ErrorEstimate(NamedTuple):
-    """What is known of the error of a measure.
+    """What is known of the error of a measure, in the unit of the measure.
 
-    value: the measure of the solution. discretisation: estimate of what the mesh leaves, signed: value + discretisation
-    is a better value. algebraic: estimate of what the solver leaves. bar: bound of the error of the value; infinite if
-    there is nothing to be said: the solution is not `OK`, the answer has no limit as the mesh is refined, or a term
-    does not say what it is on a finer mesh. reason: why that is, or empty.
+    value: the measure of the solution.
+    discretisation: signed estimate of the error of the mesh: value + discretisation is a better value.
+    algebraic: signed estimate of the error that the solver leaves.
+    bar: bound of the error of `value`. It is infinite if the solution is not `OK`, if the answer has no limit as the
+        mesh is refined, if a term does not say what it becomes on a finer mesh, or if that has no stable equilibrium
+        near.
+    reason: why the bar is infinite; empty if it is finite.
     """
 
     value: float
@@ -78,9 +72,14 @@ class ErrorEstimate(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The answer of `solve_to`: the value with its error estimate, and the scene and solution it was measured on.
+    """The answer of `solve_to`.
 
-    rung: how often the mesh was made finer. met: whether the bar is under the tolerance.
+    value: the measure on the last mesh.
+    estimate: of its error.
+    met: whether the error bar is within the tolerance.
+    rung: how often the mesh was refined.
+    scene: on the last mesh.
+    solution: of that scene.
     """
 
     value: float
@@ -95,14 +94,15 @@ class Answer(NamedTuple):
 def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: Newton = Newton()) -> ErrorEstimate:
     """The error of a measure of a solution, by the dual-weighted residual method on a finer mesh.
 
-    It costs one to three Newton steps on the finer mesh, of about four times as many unknowns. Errors of the model (the
-    material, plane strain, the width of the anchors) are no part of it.
+    It costs two to seven Newton steps on the finer mesh, which has about four times as many unknowns; while the steps
+    are short they share one factor. Errors of the model (the material, plane strain, the width of the anchors) are not
+    included.
 
     Args:
-        scene: a concrete one, with its command.
-        solution: of it.
+        scene: under its commands; concrete.
+        solution: of that scene.
         measure: `(scene, x) -> ()`, such as `jb.tip_angle` or `lambda s, x: jb.tendon_tensions(s, x)[0]`.
-        solver: its linear solver is used.
+        solver: its linear solver is used; the other settings only where the scene must be solved on the finer mesh.
 
     Raises:
         ValueError: if the scene is traced or has no triangles, or the measure returns anything but a scalar.
@@ -115,18 +115,18 @@ def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: N
 
 @usual_rules
 def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_000, solver: Newton = Newton()) -> Answer:
-    """A measure to a tolerance: from the scene's own mesh to finer ones, until the error bar is below it.
+    """Solve a scene, and refine its mesh until the error bar of a measure is within a tolerance.
 
-    Each mesh starts from what the error estimate of the one before says about it, so that two or three Newton steps are
-    left to take. Begin with a coarse mesh: rungs that suffice are never refined. A tolerance below the round-off of the
-    value is not met on any mesh, and none is refined for it.
+    The solve on a finer mesh starts from the positions that the error estimate on the mesh before predicts, so that two
+    or three Newton steps are left. Begin with a coarse mesh: refinement stops at the first mesh that suffices. A
+    tolerance below the round-off of the value cannot be met on any mesh; then the mesh is not refined.
 
     Args:
-        scene: a concrete one, with its command.
+        scene: under its commands; concrete.
         measure: as for `estimate_error`.
         tolerance: positive, in the unit of the measure.
-        most: unknowns of the largest mesh to solve on.
-        solver: settings.
+        most: number of unknowns of the largest mesh to solve on.
+        solver: settings of each solve.
 
     Raises:
         ValueError: if the tolerance is not positive and finite, or as `estimate_error` does.
@@ -149,10 +149,10 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
 
 @usual_rules
 def enriched(scene: Scene) -> tuple[Scene, Finer]:
-    """The scene on a finer mesh that contains every displacement of its own, and how nodal fields are carried over.
+    """The scene on a finer mesh, and the map of nodal fields to that mesh.
 
-    Triangles of three nodes become triangles of six, and triangles of six nodes are cut in four. Nodes keep their
-    numbers, so that terms that act on nodes stay as they are.
+    The finer mesh contains every displacement of the coarse one. Triangles of three nodes become triangles of six, and
+    triangles of six nodes are cut in four. Nodes keep their numbers, so terms that act on nodes stay as they are.
 
     Raises:
         NotRefinable: a `ValueError` that names a term which cannot be refined.
@@ -167,19 +167,19 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     finer = enriched_elements(elements, count)
     mesh = Mesh(finer.carry(np.asarray(scene.mesh.nodes)), finer.elements)
     used = finer.weights != 0
-    # A new node is fixed, or of the tip, if it lies on the surface between nodes that are.
+    # A new node is fixed if it lies on the surface between fixed nodes. The same holds for nodes of the tip.
     outside = np.isin(np.arange(len(used)), surface(mesh))
     inherit = lambda nodes: np.all(np.asarray(nodes)[finer.nodes] | ~used, axis=1)
     new = np.arange(len(used)) >= count
-    may = outside | ~new
-    fixed = np.stack([inherit(column) & may for column in scene.fixed.T], axis=1)
+    old_or_outside = outside | ~new
+    fixed = np.stack([inherit(column) & old_or_outside for column in scene.fixed.T], axis=1)
     tip = np.append(scene.tip, np.flatnonzero(inherit(np.isin(np.arange(count), scene.tip)) & outside & new))
     terms = tuple(_refined(k, term, mesh, len(finer.elements) // len(elements)) for k, term in enumerate(scene.terms))
     return Scene(mesh, terms, fixed, tip), finer
 
 
 def _refined(number: int, term: Term, mesh: Mesh, parts: int) -> Term:
-    """A term on the finer mesh, where each element has become `parts`."""
+    """Term `number` of the scene on the finer mesh, where each element is divided into `parts`."""
     try:
         return term.kind.refined(term, mesh, parts)
     except NotRefinable as error:
@@ -187,7 +187,7 @@ def _refined(number: int, term: Term, mesh: Mesh, parts: int) -> Term:
 
 
 def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton) -> tuple[ErrorEstimate, Scene, Any]:
-    """The estimate, the finer scene, and where its own solution is expected."""
+    """The estimate, the finer scene, and the positions at which the solution of the finer scene is expected."""
     if (shape := jax.eval_shape(measure, scene, solution.x).shape) != ():
         raise ValueError(f"measure: expected a function that returns a scalar, got shape {shape}")
     own = _change(scene, solution.x, measure, solver)
@@ -205,11 +205,11 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
             break
         factor = step.factor if step.length < near else None
         near, step = min(near, SHRINKING * step.length), _change(finer, step.x, measure, solver, factor=factor)
-        # A measure such as the mean over the tip may weigh nodes differently on another mesh.
+        # Compare values: a measure such as the mean over the tip may weigh nodes differently on the finer mesh.
         change = step.value - value + step.total
     moved = step.x
     if not np.isfinite(change):
-        # Too far for bare steps: it takes a solve.
+        # Newton steps without a line search failed, so solve the finer scene.
         found = equilibrium(finer, start, solver)
         moved, change = np.asarray(found.x), float(measure(finer, found.x)) - value if found.status == 0 else np.nan
     left = change * element_of(scene.mesh.elements).shortfall
@@ -219,7 +219,7 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
 
 
 def _doubt(scene: Scene, solution: Solution, change: float) -> str:
-    """Why nothing can be said about the error, or nothing."""
+    """Why no error bound is known; empty if one is."""
     if solution.status != 0:
         return "the solution is not OK"
     free = np.logical_not(scene.fixed.all(axis=1))
@@ -230,9 +230,15 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
 
 
 class _Change(NamedTuple):
-    """The value of a measure at a state; where one Newton step from there leads, `x`, and its length; by how much that
-    changes the measure, to first order; and of that, what each coordinate's force and adjoint contribute, `parts`
-    `(n, 2)`. `factor` is that of the stiffness that was used."""
+    """One Newton step from a state, and the change of a measure by it.
+
+    value: the measure at the state.
+    x: `(n, 2)` positions after the step.
+    length: largest component of the step.
+    total: change of the measure by the step, to first order.
+    parts: `(n, 2)` contribution of the force and the adjoint at each coordinate to that change.
+    factor: of the stiffness that was used, and whether that is positive definite.
+    """
 
     value: float
     x: np.ndarray
@@ -245,10 +251,16 @@ class _Change(NamedTuple):
 def _change(
     scene: Scene, x: Any, measure: Measure, solver: Newton, way: Finer | None = None, factor: Any = None
 ) -> _Change:
-    """What a Newton step from `x` would change, by its own stiffness unless the factor of one near is given.
+    """The change of a measure by one Newton step from `x`.
 
-    If the state was carried over from a coarser mesh, the adjoint is taken less its own interpolation on that: the
-    forces do no work on that, and what is left is local.
+    Args:
+        scene: of the state.
+        x: `(n, 2)` positions.
+        measure: `(scene, x) -> ()`.
+        solver: its linear solver is used.
+        way: the map from the coarser mesh, if `x` was carried over from one. Then the interpolation of the adjoint on
+            that mesh is subtracted from the adjoint. The forces do no work on it, and what is left is local.
+        factor: of the stiffness at a nearby state; by default the stiffness at `x` is factorised.
     """
     value, slope = _value_and_slope(scene, x, measure)
     layout = solver.linear.layout(topology(scene))
@@ -263,7 +275,7 @@ def _change(
 
 @compiled("solver")
 def _factor(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> tuple[Any, jax.Array]:
-    """A factor of the stiffness, and whether that is positive definite."""
+    """A factor of the stiffness at `x`, and whether the stiffness is positive definite."""
     return solver.linear.factor(layout, assemble(layout, stencil_hessians(scene, x)))
 
 
@@ -271,8 +283,10 @@ def _factor(scene: Scene, layout: Layout, x: jax.Array, solver: Newton) -> tuple
 def _newton_step(
     scene: Scene, layout: Layout, factor: tuple[Any, jax.Array], x: jax.Array, slope: jax.Array, solver: Newton
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The step to balance, the adjoint of a measure of this slope, and the unbalanced forces, `(n, 2)` each; NaN where
-    the stiffness is not positive definite."""
+    """The Newton step, the adjoint of a measure with derivative `slope`, and the unbalanced forces, each `(n, 2)`.
+
+    The step is NaN if the stiffness is not positive definite.
+    """
     forces = jnp.where(scene.fixed, 0, evaluate(scene, x).gradient)
     sides = jnp.stack([gather(layout, -forces), gather(layout, slope)], axis=1)
     step, adjoint = (expand(layout, side, x.shape) for side in solver.linear.solve(layout, factor[0], sides).T)
@@ -281,4 +295,5 @@ def _newton_step(
 
 @partial(jax.jit, static_argnames="measure")
 def _value_and_slope(scene: Scene, x: jax.Array, measure: Measure) -> tuple[jax.Array, jax.Array]:
+    """The measure `()` at `x`, and its derivative `(n, 2)` in `x`."""
     return jax.value_and_grad(lambda x: measure(scene, x))(x)

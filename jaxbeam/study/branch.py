@@ -1,9 +1,9 @@
 """Branches of equilibria, followed through folds, with the points where stability is lost and regained.
 
-Pseudo-arclength continuation (Keller 1977): a branch is a curve `(x(t), s(t))` with `s` the path's parameter,
-0 at ratio 1 and 1 at the command asked for. A step goes along the tangent, and Newton's method corrects it in
-the plane normal to it, so that a fold, where the branch turns back in `s`, is an ordinary point. The tangent
-stiffness is factored as it is, indefinite or not; the number of its negative eigenvalues tells stability.
+Pseudo-arclength continuation (Keller 1977): a branch is a curve `(x(t), s(t))`, with `s` the parameter of the path: 0
+at rest (ratio 1) and 1 at the command asked for. The predictor goes along the tangent, and the corrector is Newton's
+method in the plane normal to the tangent. So a fold, where the branch turns back in `s`, is an ordinary point. The
+tangent stiffness is factorised unmodified, indefinite or not; the number of its negative eigenvalues tells stability.
 """
 
 from __future__ import annotations
@@ -30,10 +30,9 @@ from jaxbeam.solve.residual import force_round_off, relative_residual, row_magni
 from jaxbeam.solve.solution import Status, check
 from jaxbeam.study.stability import lowest_mode
 
-# Corrections per step; a step that needs more than a few is followed by a shorter one.
+# Limit of the corrections per step. A step that does not converge within it is halved.
 MAX_CORRECTIONS = 12
-
-
+# The next step may be longer only after one that took at most this many corrections.
 EASY = 4
 
 
@@ -42,8 +41,12 @@ class Critical:
     """A point where an eigenvalue of the tangent stiffness is zero.
 
     kind: `"fold"`, where the branch turns back, or `"bifurcation"`, where another branch crosses it.
-    parameter: `s` there. ratios: `(m,)` command there. x: `(n, 2)` positions. shape: `(n, 2)` the mode.
-    eigenvalue: what is left of it (zero but for round-off). after: index of the branch's point before it.
+    parameter: `s` at the point.
+    ratios: `(m,)` commands at the point.
+    x: `(n, 2)` positions.
+    shape: `(n, 2)` mode that belongs to the eigenvalue.
+    eigenvalue: its computed value, zero up to round-off.
+    after: index of the last point of the branch before it.
     """
 
     kind: str
@@ -59,12 +62,16 @@ class Critical:
 class Branch:
     """A traced branch of `P` equilibria.
 
-    parameter: `(P,)` position `s` on the way from ratio 1 to the command. ratios: `(P, m)`. x: `(P, n, 2)`.
-    negative: `(P,)` negative eigenvalues of the tangent stiffness; stable where it is 0.
-    residual: `(P,)` relative, as in `Solution`. smallest_jacobian: `(P,)`.
+    parameter: `(P,)` position `s` on the way from rest (ratio 1) to the command.
+    ratios: `(P, m)` commands.
+    x: `(P, n, 2)` positions.
+    negative: `(P,)` number of negative eigenvalues of the tangent stiffness; stable where it is 0.
+    residual: `(P,)` relative residual, as in `Solution`.
+    smallest_jacobian: `(P,)` smallest `J`, as in `Solution`.
     overlapping: `(P,)` booleans, true where the body passes through itself.
     critical: the folds and bifurcations on it, in order.
-    ended: why it ends: `"left"` (the interval), `"points"` (as many as allowed) or `"step"` (it could not go on).
+    ended: why it ends: `"left"` (it left the interval), `"points"` (as many as allowed) or `"step"` (steps failed until
+        they were too short).
     """
 
     parameter: np.ndarray
@@ -79,12 +86,21 @@ class Branch:
 
     @property
     def stable(self) -> np.ndarray:
-        """`(P,)` booleans."""
+        """`(P,)` booleans, true where the equilibrium is stable."""
         return self.negative == 0
 
 
 class Point(NamedTuple):
-    """A point on a branch: positions, parameter, unit tangent in both, and what is known of it."""
+    """A point on a branch.
+
+    x: `(n, d)` positions.
+    s: `()` parameter.
+    dx: `(n, d)` positions' part of the unit tangent.
+    ds: `()` parameter's part of the unit tangent.
+    negative: `()` number of negative eigenvalues of the tangent stiffness.
+    residual: `()` relative residual; infinite if the corrector did not converge.
+    corrections: `()` corrections taken to get there.
+    """
 
     x: jax.Array
     s: jax.Array
@@ -111,19 +127,18 @@ def trace_branch(
 ) -> Branch:
     """Follow one branch of equilibria of the commands `rest + s (ratios - rest)`, through its folds.
 
-    At rest the ratio of a tendon is 1.
-
-    It runs on the host, one jitted step after the other, and does not jump where a beam would.
+    At rest the ratio of a tendon is 1. At a fold a real beam jumps to another branch; this function stays on the same
+    one. It runs on the host, one jitted step after the other.
 
     Args:
         scene: with `m` tendons.
         ratios: `(m,)` the command at `s = 1`.
-        x0: `(n, 2)` an equilibrium, or near one, to start at; by default the rest positions.
+        x0: `(n, 2)` positions of the start: an equilibrium, or near one; by default the rest positions.
         parameter: `s` of the start.
         direction: `1` to start towards larger `s`, `-1` towards smaller.
-        interval: the branch is followed until `s` leaves it.
-        step: largest arclength of a step, in the measure `rms displacement / size` and `s` together.
-        max_points: where to stop at the latest.
+        interval: range of `s`; the branch is followed until `s` leaves it.
+        step: largest arclength of a step: the root of `(rms displacement / size)^2 + (change of s)^2`.
+        max_points: largest number of points.
         solver: tolerance and linear solver.
         progress: called with the number of points and `s` after each step.
 
@@ -169,7 +184,13 @@ def on_the_way(scene: Scene, end: jax.Array, s: Any) -> Any:
 
 
 class Path(NamedTuple):
-    """The scenes whose equilibria are traced: the commands `rest + s (end - rest)`."""
+    """The scenes whose equilibria are traced: those under the commands `rest + s (end - rest)`.
+
+    scene: any of them.
+    end: `(m,)` commands at `s = 1`.
+    layout: of their stiffness.
+    solver: tolerance and linear solver.
+    """
 
     scene: Scene
     end: jax.Array
@@ -184,15 +205,15 @@ class Path(NamedTuple):
         return on_the_way(self.scene, self.end, s)
 
     def advance(self, here: Point, length: float) -> Point:
-        """The point of the branch at `length` along the tangent of `here`."""
-        size = jnp.asarray(length, here.s.dtype)
-        return _advance(unlock(self.scene), self.layout, self.end, here, size, solver=self.solver)
+        """The point of the branch at arclength `length` along the tangent of `here`."""
+        arclength = jnp.asarray(length, here.s.dtype)
+        return _advance(unlock(self.scene), self.layout, self.end, here, arclength, solver=self.solver)
 
 
 def _first_state(path: Path, parameter: float, x0: Numbers | None) -> jax.Array:
     """The equilibrium `(n, 2)` to start at."""
     found = equilibrium(path.scene_at(parameter), x0, dataclasses.replace(path.solver, escape=False))
-    # A saddle, a critical point or a body that overlaps itself lies on a branch as well as any other state.
+    # A branch may start at a saddle, at a critical point, or where the body overlaps itself.
     if found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID):
         check(found)
     return found.x
@@ -206,7 +227,7 @@ def _walk(
     max_points: int,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[list[Point], list[Critical], str]:
-    """Points from the `first` one on, the critical points between them, and why they end."""
+    """The points from `first` on, the critical points between them, and why the walk ended (as in `Branch`)."""
     tolerance, size = path.solver.tolerance(first.x.dtype), float(extent(path.scene))
     points, length = [first], step
     critical: list[Critical] = []
@@ -214,7 +235,7 @@ def _walk(
         old, new = points[-1], path.advance(points[-1], length)
         if not float(new.residual) <= tolerance or _strays(old, new, length, size):
             length /= 2
-            # Also where the step is infinite, and half of it as well.
+            # An infinite `step` ends here too, because half of it is infinite as well.
             if not length > 1e-6 * step:
                 return points, critical, "step"
             continue
@@ -247,16 +268,14 @@ def _branch(path: Path, points: list[Point], critical: list[Critical], ended: st
     )
 
 
-# How far a point may lie off the tangent it was predicted along, over the step, and the least cosine between the
-# tangents of neighbours. Wider limits let a step jump to another branch.
+# Largest distance of a new point from its prediction, over the length of the step, and least cosine of the angle
+# between the tangents of neighbours. Wider limits let a step jump to another branch.
 MAX_OFFSET = 0.1
-
-
 MIN_COSINE = 0.9
 
 
 def _strays(old: Point, new: Point, length: float, size: float) -> bool:
-    """Whether a step has left the old tangent so far that the new point may be on another branch."""
+    """Whether the new point lies so far from the old tangent that it may be on another branch."""
     weight = 1 / (new.x.size * size**2)
     offset = weight * jnp.sum((new.x - old.x - length * old.dx) ** 2) + (new.s - old.s - length * old.ds) ** 2
     cosine = weight * jnp.sum(new.dx * old.dx) + new.ds * old.ds
@@ -265,13 +284,13 @@ def _strays(old: Point, new: Point, length: float, size: float) -> bool:
 
 @partial(jax.jit, static_argnames="solver")
 def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: jax.Array, solver: Newton) -> Point:
-    """The point of the branch at `length` along the tangent of `here`."""
+    """The point of the branch at arclength `length` along the tangent of `here`."""
     rtol = solver.tolerance(here.x.dtype)
-    # Inner product of displacements: mean square over the body's size.
+    # Weight of the inner product of displacements: their mean square, over the square of the body's size.
     weight = 1 / (here.x.size * extent(scene) ** 2)
 
     def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Steps to balance at fixed s, and with s; residual and inertia."""
+        """The Newton step at fixed `s`, the derivative of the positions in `s`, the residual, and the inertia."""
         scene_at = lambda s: command(scene, on_the_way(scene, end, s))
         at = evaluate(scene_at(s), x)
         hessians = stencil_hessians(scene_at(s), x)
@@ -284,6 +303,7 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
         return solve(gradient), solve(gather(layout, rate)), residual, negative
 
     def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:
+        """One Newton step of the corrector, unless the point has converged; and whether it has."""
         point, _ = carry
         balance, along, residual, negative = linearise(point.x, point.s)
         miss = weight * jnp.sum(here.dx * (point.x - here.x)) + here.ds * (point.s - here.s) - length
@@ -312,13 +332,21 @@ def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: 
 
 
 def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Critical:
-    """The critical point between two neighbours: the root, along the branch, of the eigenvalue that changes sign.
+    """The critical point between two neighbours: where, along the branch, an eigenvalue changes sign.
 
-    Regula falsi with the Illinois rule (Dowell and Jarratt 1971).
+    The root is found by regula falsi with the Illinois rule (Dowell and Jarratt 1971).
+
+    Args:
+        path: the scenes.
+        old: point before it.
+        new: point after it, at arclength `length` from `old`.
+        length: arclength between them.
+        after: index of `old` in the branch.
     """
     which = min(int(old.negative), int(new.negative))
 
     def eigen(point: Point) -> tuple[float, jax.Array]:
+        """The eigenvalue that changes sign, and its mode `(n, 2)`."""
         modes = lowest_mode(path.scene_at(point.s), point.x, which + 1, path.solver)
         return float(modes.values[which]), modes.shapes[which]
 

@@ -1,4 +1,4 @@
-"""The tendon beam by hand: linear beam theory, against which models are compared."""
+"""The tendon beam by a hand calculation: linear beam theory, to compare models with."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ from jaxbeam.physics.tendon import check_law, inverse_square_stiffness
 
 
 class Estimate(NamedTuple):
-    """What a hand calculation gives: `tip_angle` `()` in degrees, `lengths` and `tensions` `(2,)` of the tendons."""
+    """The result of the hand calculation.
+
+    tip_angle: `()` in degrees.
+    lengths: `(2,)` of the tendons, in the unit of length.
+    tensions: `(2,)` of the tendons, in the unit of force.
+    """
 
     tip_angle: jax.Array
     lengths: jax.Array
@@ -40,17 +45,19 @@ def euler_bernoulli(
     """The tendon beam by hand: linear Euler-Bernoulli theory in plane strain, with eccentric tendons.
 
     Over the half with tendons the axial strain `eps` and the curvature `kappa` are constant. With `a = length / 2`,
-    `e = +H/2` (top) and `-H/2` (bottom), tendon lengths `l = a (1 + eps - e kappa)` and tensions `T = k (l - l*)`,
+    eccentricities `e = +H/2` (top) and `-H/2` (bottom), tendon lengths `l = a (1 + eps - e kappa)`, commanded lengths
+    `l*` and tensions `T = k (l - l*)`, equilibrium gives two linear equations,
 
-        E' H eps + sum T = 0,     E' H^3/12 kappa - sum e T = 0,     E' = E / (1 - nu^2):
+        E' H eps + sum T = 0,     E' H^3/12 kappa - sum e T = 0,     E' = E / (1 - nu^2).
 
-    two linear equations. The other half stays straight, so the tip rises by `kappa a^2 / 2 + kappa a a`.
+    The other half stays straight, so the tip rises by `kappa a^2 / 2 + kappa a a`.
 
     Args:
-        ratios: `(2,)` of the top and the bottom tendon.
+        ratios: `(2,)` commanded ratios of the top and the bottom tendon.
         length: of the beam.
         height: of the beam.
-        young: Young's modulus, scalar. (1e4, 0.45) in `macklin_mueller` is (9962, 0.4444) at small strain.
+        young: Young's modulus, scalar. To compare with `macklin_mueller`, give what that is at small strain: for its
+            Young's modulus 1e4 and Poisson's ratio 0.45, give 9962 and 0.4444.
         poisson: Poisson's ratio, scalar.
         tendon_modulus: scalar or `(2,)`.
         stiffness: the law of the tendons, see `tendons`.
@@ -59,8 +66,8 @@ def euler_bernoulli(
         An `Estimate`, differentiable in every real argument.
 
     Raises:
-        ValueError: if an argument has another shape or a concrete one is outside its range, which is that of
-            `rod_beam`. Where a traced one is, the answer is NaN.
+        ValueError: if an argument has another shape, or a concrete one is out of range; ranges are those of `rod_beam`.
+            A traced argument that is out of range makes the result NaN.
     """
     values = (
         checks.numbers("ratios", ratios, checks.POSITIVE, ((2,),), "of the top and the bottom tendon"),
@@ -85,7 +92,7 @@ def _by_hand(
     tendon_modulus: jax.Array,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array],
 ) -> Estimate:
-    """`euler_bernoulli` of arrays."""
+    """`euler_bernoulli` for arrays that were checked."""
     half, plane = 0.5 * length, young / (1 - poisson**2)
     commanded = ratios * half
     k = stiffness(tendon_modulus, commanded)

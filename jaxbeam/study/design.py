@@ -1,4 +1,4 @@
-"""What inverse design answers."""
+"""The result of inverse design."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from jaxbeam.solve.solution import Solution
 
 
 class DesignStatus(enum.IntEnum):
-    """How a design ended."""
+    """How a design ended.
+
+    REACHED: the target or goal is met; or, for `minimise` without a goal, the loss is stationary.
+    UNREACHABLE: the search converged to a stationary point away from the target or goal.
+    NOT_CONVERGED: neither.
+    """
 
     REACHED = 0
     UNREACHABLE = 1
@@ -22,9 +27,11 @@ class DesignStatus(enum.IntEnum):
 
 @pytree
 class History:
-    """What was tried, in order; NaN (status -1) beyond what was needed.
+    """The trials, in order. Entries after the last trial hold NaN, and status -1.
 
-    theta: `(K, ...)` parameters. loss: `(K,)`. status: `(K,)` of their equilibria; one that is not `OK` was skipped.
+    theta: `(K, ...)` parameters of each trial.
+    loss: `(K,)` their losses.
+    status: `(K,)` status of their equilibria; a trial that is not `OK` was skipped.
     """
 
     theta: Any
@@ -36,14 +43,14 @@ class History:
 class Design:
     """What a design found.
 
-    theta: the parameters: for `reach` `(m,)` commanded ratios.
+    theta: the parameters; for `reach` the commands `(m,)`.
     solution: their equilibrium.
-    value: the measure there; for `minimise` the loss.
-    loss: `()` distance from the target, Euclidean; for `minimise` the loss.
-    held: `(m,)` -1 where the lower bound holds a command back, 1 where the upper does, else 0: without that bound the
-        answer would be nearer to the target, or as near with less effort.
-    solves: `()` equilibria solved.
-    history: of all of them.
+    value: the measure of that equilibrium; for `minimise` the loss.
+    loss: `()` Euclidean distance of the value from the target; for `minimise` the loss.
+    held: `(m,)` -1 where the lower bound holds a command back, 1 where the upper does, else 0. Without a bound that
+        holds, the answer would be nearer to the target, or as near with less effort.
+    solves: `()` number of equilibria solved.
+    history: record of all of them.
     status: `()` int32 of a `DesignStatus`.
     """
 

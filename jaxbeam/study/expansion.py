@@ -1,14 +1,15 @@
-"""A measure as a function of the commands, to second order, at an equilibrium that was solved.
+"""Second-order expansion of a measure in the commands, at a solved equilibrium.
 
-With the positions `x(theta)` in balance, `g(theta, x) = 0`, and `K` the tangent stiffness, whose factor is at hand:
+The positions `x(theta)` are in balance, `g(theta, x) = 0`, and a factor of the tangent stiffness `K` is known from the
+solve. For a measure `q(theta, x)`,
 
     drift   dx/dtheta = -K^-1 dg/dtheta
-    slope   dq/dtheta along (1, drift)
-    bend    second derivative along (1, drift) of  q + price . g,  with  price = -K^-1 dq/dx
+    slope   derivative of  q  along (1, drift)
+    bend    second derivative along (1, drift) of  q + price . g,  with multipliers  price = -K^-1 dq/dx
 
-The last is the adjoint formula for second derivatives (Nocedal and Wright 2006, section 12.5): with this price the
-second derivative of `x` itself drops out. All takes one solve with as many right-hand sides as there are commands and
-components of the measure.
+`bend` is the adjoint formula for second derivatives (Nocedal and Wright 2006, section 12.5): with these multipliers the
+second derivative of `x` drops out. The expansion takes one solve, with a right-hand side for each command and for each
+component of the measure.
 """
 
 from __future__ import annotations
@@ -29,8 +30,13 @@ Measure = Callable[[Scene, jax.Array], jax.Array]
 
 
 class Expansion(NamedTuple):
-    """A measure around a command: `value` `(p,)`, `slope` `(p, m)`, `bend` `(p, m, m)`; and `drift` `(n, 2, m)`, the
-    derivative of the positions."""
+    """A measure of `p` components around `m` commands.
+
+    value: `(p,)` of the measure.
+    slope: `(p, m)` first derivatives in the commands.
+    bend: `(p, m, m)` second derivatives in the commands.
+    drift: `(n, 2, m)` derivative of the positions in the commands.
+    """
 
     value: Any
     slope: Any
@@ -42,16 +48,25 @@ class Expansion(NamedTuple):
 def expand_measure(
     scene: Scene, layout: Layout, theta: jax.Array, x: jax.Array, factor: Any, measure: Measure, linear: LinearSolver
 ) -> Expansion:
-    """The measure around the commands `theta` `(m,)`, in equilibrium at `x` `(n, 2)` with this `factor` of the
-    stiffness. It means nothing where `x` is no equilibrium, except for the value."""
+    """The measure around the commands `theta`. If `x` is not an equilibrium, only `value` is meaningful.
+
+    Args:
+        scene: under any commands.
+        layout: of its stiffness.
+        theta: `(m,)` commands.
+        x: `(n, 2)` their equilibrium.
+        factor: of the stiffness there.
+        measure: `(scene, x)` to `()` or `(p,)`.
+        linear: the linear solver that made the factor.
+    """
     m = theta.size
     outcome = lambda theta, x: jnp.ravel(measure(command(scene, theta), x))
     unbalanced = lambda theta, x: energy_gradient(command(scene, theta), x)
 
-    pull = jax.jacfwd(unbalanced)(theta, x)
-    sight = jnp.moveaxis(jax.jacrev(outcome, argnums=1)(theta, x), 0, -1)
+    dg_dtheta = jax.jacfwd(unbalanced)(theta, x)
+    dq_dx = jnp.moveaxis(jax.jacrev(outcome, argnums=1)(theta, x), 0, -1)
     columns = partial(jax.vmap, in_axes=-1, out_axes=-1)
-    rhs = columns(partial(gather, layout))(jnp.concatenate([pull, sight], axis=-1))
+    rhs = columns(partial(gather, layout))(jnp.concatenate([dg_dtheta, dq_dx], axis=-1))
     moved = columns(lambda v: expand(layout, v, x.shape))(-linear.solve(layout, factor, rhs))
     drift, price = moved[..., :m], moved[..., m:]
 

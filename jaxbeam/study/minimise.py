@@ -1,4 +1,4 @@
-"""Inverse design by any loss of any scene that is a function of parameters, with any optax optimiser."""
+"""Inverse design with any loss, any scene that is a function of parameters, and any optax optimiser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from jaxbeam.study.design import Design, DesignStatus, History
 
 # --------------------------------------------------------------------------------------------- minimise
 
-# Steps in a row that may be taken back because there is no equilibrium where they lead.
+# How often in a row a step may be halved because no equilibrium is found where it leads.
 MAX_SKIPS = 20
 
 
@@ -40,26 +40,27 @@ def minimise(
     solver: Newton = Newton(),
     progress: Callable[[int, float], None] | None = None,
 ) -> Design:
-    """Parameters that make a loss of the equilibrium least, by any optimiser of optax.
+    """Minimise a loss of the equilibrium over parameters, with any optimiser of optax.
 
-    Each equilibrium is started from the one before. Where the status of one is not `OK` the step that led there is
-    halved, back towards the last good parameters, and the optimiser does not see it. Parameters are not bounded:
-    let `design` map them to what is, for example `ratios = 0.4 + 0.6 * jax.nn.sigmoid(theta)`.
+    Each solve starts from the equilibrium before. If its status is not `OK`, the step that led there is halved, back
+    towards the last good parameters; the optimiser does not see the failed trial. Parameters are not bounded: let
+    `design` map them to quantities that are, for example `ratios = 0.4 + 0.6 * jax.nn.sigmoid(theta)`.
 
     Args:
         loss: `(scene, x)` to `()`.
-        theta0: any pytree of float arrays.
+        theta0: parameters to start from, any pytree of float arrays.
         optimiser: such as `optax.adam(1e-2)` or `optax.lbfgs()`, whose line search solves equilibria of its own.
-        steps: at most so many.
-        design: `theta` to a scene: commands, moduli, stiffness fields, rest positions, whatever it is made of.
-        tolerance: it stops where the largest component of the gradient has fallen to this fraction of the first.
-        goal: it stops at a loss no larger than this. Without one every stationary point is a success.
+        steps: largest number of steps, halvings included.
+        design: `theta` to a scene. Anything in a scene may depend on `theta`: commands, moduli, stiffness fields, rest
+            positions.
+        tolerance: stop when the largest component of the gradient is at most this fraction of that of the first one.
+        goal: stop at a loss of at most this. Without a goal every stationary point counts as a success.
         solver: settings of each solve.
-        progress: called with the number of steps and the loss.
+        progress: called after each trial with the number of steps and the loss.
 
     Returns:
-        A `Design`: `REACHED` at the goal, or without one at a stationary point; `UNREACHABLE` at a stationary point
-        over the goal; else `NOT_CONVERGED`. `theta` is the best that was seen.
+        A `Design`. Its status is `REACHED` at the goal, or without a goal at a stationary point; `UNREACHABLE` at a
+        stationary point above the goal; else `NOT_CONVERGED`. `theta` is the best of all trials.
 
     Raises:
         ValueError: if `steps` is not a whole number of at least 0, `theta0` holds no floats, or as `design` does.
@@ -81,7 +82,7 @@ def minimise(
 def _check_arguments(
     loss: Any, design: Any, optimiser: Any, steps: int, tolerance: float, goal: float | None
 ) -> tuple[float, float | None]:
-    """The tolerance and the goal, checked with the rest."""
+    """Check the arguments of `minimise`, and return the tolerance and the goal."""
     for name, value, form in (("loss", loss, "(scene, x) -> scalar"), ("design", design, "(theta) -> scene")):
         checks.function(name, value, form)
     if not hasattr(optimiser, "update"):
@@ -92,8 +93,10 @@ def _check_arguments(
 
 
 def _strong(tree: Any) -> Any:
-    """Its leaves as arrays of a definite dtype: a weak one turns strong in the first update, and all would be compiled
-    again."""
+    """The tree with leaves of a strong dtype.
+
+    A weakly typed leaf would become strong in the first update, and every program would be compiled again.
+    """
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
 
 
@@ -101,9 +104,10 @@ def _strong(tree: Any) -> Any:
 
 
 class Programs(NamedTuple):
-    """What is compiled, for one loss and one optimiser.
+    """The compiled functions for one loss, design, optimiser and solver.
 
-    evaluate: `(theta, x)` to the loss with its solution, and the gradient. init: `theta` to the optimiser's state.
+    evaluate: `(theta, x)` to `((loss, solution), gradient)`; the solve starts at `x`.
+    init: `theta` to the optimiser's state.
     advance: `(theta, state, gradient, loss, x)` to the next `theta` and state.
     """
 
@@ -113,6 +117,7 @@ class Programs(NamedTuple):
 
 
 def _programs(loss: Any, design: Any, optimiser: optax.GradientTransformation, solver: Newton) -> Programs:
+    """The functions that `minimise` calls in its loop."""
 
     def objective(theta: Any, x: jax.Array) -> tuple[jax.Array, Solution]:
         scene = design(theta)
@@ -120,7 +125,7 @@ def _programs(loss: Any, design: Any, optimiser: optax.GradientTransformation, s
         return loss(scene, solution.x), solution
 
     def finite_loss(theta: Any, x: jax.Array) -> jax.Array:
-        """What a line search sees: an infinite loss where there is no equilibrium."""
+        """The loss for the optimiser's line search: infinite where the solve fails."""
         value, solution = objective(theta, x)
         return jnp.where(solution.status == 0, value, jnp.inf)
 
@@ -137,12 +142,18 @@ def _programs(loss: Any, design: Any, optimiser: optax.GradientTransformation, s
 
 @dataclasses.dataclass
 class DescentState:
-    """Where a minimisation is.
+    """The state of a minimisation.
 
-    theta: parameters to try next. x: `(n, 2)` the equilibrium to start from. optimiser: the optimiser's state.
-    last: the last parameters that have an equilibrium. first_slope: largest component of the first gradient.
-    solves: equilibria solved. skips: steps taken back in a row. best: parameters, solution and loss of the best.
-    tried: parameters, loss and status of each.
+    theta: parameters to try next.
+    x: `(n, 2)` equilibrium to start the next solve from.
+    optimiser: the optimiser's state.
+    last: parameters of the last good trial.
+    first_slope: largest component of the first gradient.
+    solves: number of equilibria solved.
+    skips: number of failed trials in a row.
+    best: parameters, solution and loss of the best trial.
+    tried: parameters, loss and status of each trial.
+    status: how the minimisation ends.
     """
 
     theta: Any
@@ -165,7 +176,7 @@ def _descend(
     goal: float | None,
     progress: Callable[[int, float], None] | None,
 ) -> None:
-    """Step by step until the loss is at the goal, or stationary, or there is no going on."""
+    """Take steps until the loss is at the goal or stationary, no steps are left, or too many trials fail in a row."""
     for count in range(steps + 1):
         (value, solution), grad = programs.evaluate(state.theta, state.x)
         slope = max(float(np.max(np.abs(leaf))) for leaf in jax.tree.leaves(grad))
@@ -192,7 +203,7 @@ def _descend(
 
 
 def _record(state: DescentState, solution: Solution, loss: float, slope: float) -> bool:
-    """Note what was tried, and say whether it can be gone on from."""
+    """Record the trial of `state.theta`. Returns whether it is good: status `OK`, finite loss and gradient."""
     status = int(solution.status)
     state.solves += 1
     state.tried.append((state.theta, loss, status))
@@ -204,10 +215,12 @@ def _record(state: DescentState, solution: Solution, loss: float, slope: float) 
 
 @jax.jit
 def _halfway(a: Any, b: Any) -> Any:
+    """The mean of two trees."""
     return jax.tree.map(lambda x, y: 0.5 * (x + y), a, b)
 
 
 def _report(state: DescentState) -> Design:
+    """The `Design` made from the final state."""
     assert state.best is not None
     theta, solution, loss = state.best
     thetas, losses, statuses = zip(*state.tried, strict=True)

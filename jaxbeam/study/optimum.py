@@ -1,16 +1,17 @@
-"""The derivative of a commanded answer: how what `reach` found moves with the target and the scene.
+"""The derivative of the answer of `reach` with respect to the target, the bounds and the scene.
 
-The search is not differentiated. Its answer `theta` is a stationary point of a Lagrangian over the commands that no
-bound holds, with one multiplier `price` for each component of the measure (Nocedal and Wright 2006, section 12.3):
+The search is not differentiated. Its answer `theta` is a stationary point of a Lagrangian `L` over the commands that no
+bound holds. `L` has one multiplier, `price`, for each component of the measure (Nocedal and Wright 2006, section 12.3):
 
     reached      L = 1/2 |(theta - rest) / unit|^2 + price . (measure - target)
     unreachable  L = 1/2 |measure - target|^2
 
-so by the implicit function theorem `z = (theta, price)` moves by `H dz = -d(grad L)`, with `H` the Hessian of `L` in
-`z`. Commands that a bound holds move with it. `L` contains the equilibrium, whose own derivative is implicit.
+By the implicit function theorem `z = (theta, price)` changes by `H dz = -d(grad L)`, with `H` the Hessian of `L` in
+`z`. Commands that a bound holds change with the bound. `L` contains the equilibrium, whose derivative is implicit too
+(see `jaxbeam.solve.implicit`).
 
-The derivative is NaN where it does not exist or the theorem says nothing: where the search did not converge, where
-`H` is singular, and where a command lies at a bound that does not hold it, for it moves to one side only.
+The derivative is NaN where it does not exist or the theorem does not apply: where the search did not converge, where
+`H` is singular, and where a command lies at a bound that does not hold it, because it can move to one side only.
 """
 
 from __future__ import annotations
@@ -36,7 +37,14 @@ from jaxbeam.study.search import REST
 
 @pytree
 class Problem:
-    """What is the same for every target. `low`, `high` `(m,)`, `tolerance` `()`."""
+    """The data that all targets share.
+
+    scene: under any commands.
+    layout: of its stiffness.
+    low: `(m,)` lower bounds of the commands.
+    high: `(m,)` upper bounds.
+    tolerance: `()` largest deviation from a target that counts as reached.
+    """
 
     scene: Scene
     layout: Layout
@@ -48,9 +56,12 @@ class Problem:
 class Answer(NamedTuple):
     """What a search found.
 
-    theta: `(m,)` commands. x: `(n, 2)` their equilibrium. held: `(m,)` the bounds that hold, as in `Design`.
-    reached: `()` whether the target is met. trusted: `()` whether the search converged, to an equilibrium.
-    factor: of the stiffness there, made by `move_answer`; finite where the answer is not trusted.
+    theta: `(m,)` commands.
+    x: `(n, 2)` their equilibrium.
+    held: `(m,)` the bounds that hold, as in `Design`.
+    reached: `()` whether the target is met.
+    trusted: `()` whether the search converged and its solve has status `OK`.
+    factor: of the stiffness at `x`, made by `move_answer`. It is replaced by a finite one if the answer is not trusted.
     """
 
     theta: jax.Array
@@ -64,14 +75,15 @@ class Answer(NamedTuple):
 def move_answer(
     measure: Measure, solver: Newton, problem: Problem, target: jax.Array, answer: Answer, solution: Solution
 ) -> tuple[jax.Array, Solution, jax.Array]:
-    """Commands, solution and value of an answer as functions of the problem and the target."""
-    # Equal bounds hold a command whatever it would gain without them.
+    """Commands, solution and value of an answer, with their derivatives in the problem and the target attached."""
+    # A command with equal bounds is always held, whether or not it would gain without them.
     held = jnp.where(problem.low == problem.high, 1, answer.held)
     still = lax.stop_gradient(unlock(command(problem.scene, answer.theta)))
-    # XLA drops it where nothing is differentiated.
+    # XLA removes this factorisation if nothing is differentiated.
     storage = assemble(problem.layout, stencil_hessians(still, answer.x))
     factor, _ = solver.linear.factor(problem.layout, storage)
-    # Any finite one in place of a bad one: zero times NaN would reach a loss that does not look at the answer.
+    # Replace the factor of a failed search by a finite one: zero times NaN would reach a loss that does not depend
+    # on the answer.
     sane = jax.tree.map(lambda leaf: jnp.where(answer.trusted, leaf, 1), factor)
     answer = answer._replace(held=held, factor=sane)
     theta, _ = follow_optimum(measure, solver.linear, problem, jnp.ravel(target), answer)
@@ -84,8 +96,10 @@ def move_answer(
 def follow_optimum(
     measure: Measure, linear: LinearSolver, problem: Problem, target: jax.Array, answer: Answer
 ) -> tuple[jax.Array, jax.Array]:
-    """`theta` `(m,)` of the answer itself and the multipliers `(p,)`, which move with the problem and the target
-    `(p,)`. The tangents of the answer are ignored."""
+    """`theta` `(m,)` of the answer and the multipliers `price` `(p,)`, with their derivatives attached.
+
+    They are differentiable in the problem and in the target `(p,)`. Tangents of the answer are ignored.
+    """
     slope = jax.jacrev(lambda theta: _outcome(measure, linear, problem, theta, answer))(answer.theta)
     unit = command_units(problem.scene, problem.low, problem.high)
     slope = jnp.where(answer.held == 0, slope * unit, 0)
@@ -108,7 +122,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     problem_dot, target_dot, _ = tangents
     m, p = answer.theta.size, target.size
     theta, price = follow_optimum(measure, linear, *primals)
-    # What is bad stays out of the derivatives of a loss that does not look at it.
+    # Keep the NaN of a failed search out of derivatives of a loss that does not depend on it.
     unit = command_units(problem.scene, problem.low, problem.high)
     goal = jnp.where(answer.trusted, target, 0)
     theta = jnp.where(answer.trusted, theta, answer.theta)
@@ -127,7 +141,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     slope = jax.grad(lagrangian, argnums=2)
 
     def product(v: jax.Array) -> jax.Array:
-        """The Hessian of the Lagrangian over what is free; the unit matrix over what a bound holds."""
+        """The Hessian of the Lagrangian times `v`; the unit matrix in its place for commands that a bound holds."""
         moved = jax.jvp(partial(slope, problem, goal), (at,), (jnp.where(held, 0, v),))[1]
         return jnp.where(held, v, moved)
 
@@ -137,7 +151,7 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
     values, vectors = jnp.linalg.eigh(scaled)
     small = jnp.sqrt(jnp.finfo(at.dtype).eps)
     sound = jnp.min(jnp.abs(values)) > small * jnp.max(jnp.abs(values))
-    # At a bound that does not hold it, and with something to gain or to lose by leaving it.
+    # There is no derivative if a command lies at a bound that does not hold it and is coupled to another unknown.
     near = REST * unit
     weak = (answer.held == 0) & ((theta - problem.low <= near) | (problem.high - theta <= near))
     coupled = jnp.max(jnp.abs(scaled - jnp.diag(jnp.diagonal(scaled))), axis=1) > small
@@ -148,14 +162,22 @@ def _follow_optimum_jvp(measure: Measure, linear: LinearSolver, primals: Any, ta
         return jnp.where(answer.trusted & sound, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(b.dtype))
 
     pull = jax.jvp(slope, (problem, goal, at), (problem_dot, target_dot, carried))[1]
-    # Commands without an effect do not ask what the target is: where the search failed their slope is NaN all the same.
+    # If the commands have no effect, the right-hand side does not contain the target. Add it for a failed search, so
+    # that its derivative is NaN all the same.
     pull = pull.at[m:].add(jnp.where(answer.trusted, 0, target_dot))
     moved = lax.custom_linear_solve(product, -jnp.where(held, 0, pull), solve, symmetric=True) + carried
     return (theta, price), (moved[:m], moved[m:])
 
 
 def _scales(hessian: jax.Array, held: jax.Array, reached: jax.Array, m: int) -> jax.Array:
-    """What each unknown `(m + p,)` is multiplied by, so that the Hessian has no unit and its entries are about 1."""
+    """Scale `(m + p,)` of each unknown. The Hessian times the scales of row and column has no unit, and entries near 1.
+
+    Args:
+        hessian: `(m + p, m + p)` of the Lagrangian.
+        held: `(m + p,)` whether a bound holds the unknown.
+        reached: `()` whether the target is met.
+        m: number of commands.
+    """
     norm = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=-1))
     inverse = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
     curvature = jnp.max(jnp.abs(jnp.where(held[:m, None], 0, hessian[:m, :m])))

@@ -4,8 +4,9 @@ Of all steps `s` within a box, find the one of least effort that brings the line
 
     minimise  1/2 s^T A s + (theta - rest)^T s + |slope s + miss|^2 / (2 soft)
 
-The last term is so steep that it is a constraint where that can be met. Its quasi-definite system (Vanderbei 1995) has
-a solution also where it cannot, and where the slope vanishes.
+The last term is a penalty so steep that it acts as the constraint `slope s + miss = 0` where that can be met. The
+quasi-definite system of this problem (Vanderbei 1995) has a solution also where the constraint cannot be met, and where
+the slope vanishes.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ EPS = float(np.finfo(np.float64).eps)
 
 
 class Program(NamedTuple):
-    """What a step is planned by.
+    """The data of the quadratic program. Commands are in multiples of their unit.
 
     theta: `(m,)` commands.
     rest: `(m,)` commands of no effort.
     miss: `(p,)` measure minus target.
-    slope: `(p, m)` first and bend: `(p, m, m)` second derivatives of the measure.
-    held: `(m,)` the bounds that held at the last step, -1, 0 or 1. low, high: `(m,)` box of the step.
-    soft: `()` how soft the constraint is, in the unit of a squared slope.
+    slope: `(p, m)` first derivatives of the measure.
+    bend: `(p, m, m)` second derivatives of the measure.
+    held: `(m,)` bounds that held the commands at the last step: -1 the lower, 1 the upper, 0 none.
+    low: `(m,)` lower sides of the box of the step.
+    high: `(m,)` upper sides of the box.
+    soft: `()` softness of the constraint, in the unit of a squared slope.
     """
 
     theta: np.ndarray
@@ -40,15 +44,15 @@ class Program(NamedTuple):
 
 
 def softness(scale: float) -> float:
-    """`soft` for the largest squared norm of a slope that was seen."""
+    """`soft` for a search whose slopes had at most the squared norm `scale` so far."""
     return EPS**0.75 * (scale if scale > 0 else 1.0)
 
 
 def best_step(program: Program) -> tuple[np.ndarray, np.ndarray]:
-    """The step `(m,)` and the sides of its box that hold `(m,)`: -1 for the lower one, 1 for the upper, else 0.
+    """The step `(m,)` and the sides of its box that hold it, `(m,)`: -1 for the lower one, 1 for the upper, else 0.
 
-    `A` is the Hessian of a Lagrangian. Its multipliers are those that balance the effort of the free commands; if the
-    step that follows from them does not even halve the miss, those of a target that stays out of reach.
+    `A` is the Hessian of a Lagrangian. The multipliers tried first balance the effort of the free commands. If the step
+    with these does not halve the miss, the multipliers `miss / soft` of a target out of reach are used.
     """
     theta, miss, slope, soft = program.theta, program.miss, program.slope, program.soft
     free = np.where(program.held == 0, slope, 0)
@@ -62,15 +66,20 @@ def best_step(program: Program) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weighted(price: np.ndarray, bend: np.ndarray) -> np.ndarray:
-    """Curvature `(m, m)` of the components of the measure, weighted by a `price` `(p,)`."""
+    """Sum `(m, m)` of the second derivatives `bend` of the measure, weighted by the multipliers `price` `(p,)`."""
     return (price @ bend.reshape(len(price), -1)).reshape(bend.shape[1:])
 
 
 def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step, and the sides that hold, for a `curvature` `(m, m)` beside that of the effort.
+    """The step `(m,)` and the sides that hold it `(m,)`, by an active-set method.
 
-    An active set: sides that are overstepped are taken up, the worst first, and those that would have to pull are let
-    go.
+    A side that the step violates enters the active set, the most violated first. A side whose multiplier is negative
+    leaves it.
+
+    Args:
+        program: to solve.
+        curvature: `(m, m)` of the weighted measure, added to that of the effort.
+        weight: of the squared slope, see `_convex`.
     """
     m, p = program.theta.size, program.miss.size
     low, high = program.low, program.high
@@ -81,7 +90,7 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
     rhs = np.append(program.rest - program.theta, -program.miss)
 
     def solve(held: np.ndarray) -> np.ndarray:
-        """Step and multipliers where the sides that hold are equations."""
+        """Step and multipliers `(m + p,)` if the active sides are equations."""
         rows, right = matrix.copy(), rhs.copy()
         for k in np.flatnonzero(held):
             rows[k], rows[k, k] = 0, 1
@@ -93,7 +102,7 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
         both = solve(held)
         step = both[:m]
         over = np.where(held == 0, np.maximum(step - high, low - step), 0)
-        # What the side has to push with: negative where it would have to pull.
+        # Multipliers of the active sides. A side pushes the step into the box; one with a negative sign would pull.
         push = np.where(held == 0, 0, -held * (matrix[:m] @ both - rhs[:m]))
         worst, wrong = np.argmax(over), np.argmin(push)
         if over[worst] > 16 * EPS:
@@ -108,10 +117,10 @@ def _step_in_box(program: Program, curvature: np.ndarray, weight: float) -> tupl
 
 
 def _convex(program: Program, curvature: np.ndarray, weight: float) -> np.ndarray:
-    """`A` `(m, m)`: the curvature and that of the effort, made convex.
+    """`A` `(m, m)`: the `curvature` plus that of the effort, made convex.
 
-    What must be convex is their sum with `weight` times the squared slope, over the commands that no bound held last:
-    the target takes care of the rest.
+    Only the sum of `A` and `weight` times `slope^T slope` is made positive definite, over the commands that no bound
+    held at the last step. In the directions of the slope the constraint makes the problem convex.
     """
     free = (program.held == 0)[:, None] & (program.held == 0)
     square = weight * np.where(free, program.slope.T @ program.slope, 0)

@@ -1,4 +1,4 @@
-"""Inverse design by commands: of all that make a measure what it should be, those of least effort."""
+"""Inverse design by commands: of all commands that bring a measure to a target, those of least effort."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ from jaxbeam.study.search import SearchState, Task, Trial, search
 
 # ------------------------------------------------------------------------------------------------ reach
 
-
-# Bounds of the ratios of tendons, unless others are given.
+# Default bounds of the ratios of tendons.
 RATIOS = (0.4, 1.0)
 
 
@@ -46,39 +45,40 @@ def reach(
 ) -> Design:
     """Commands within `bounds` at which `measure` of the equilibrium is `target`.
 
-    Of all that reach it, the one of least effort `sum (1 - ratio)^2`; if none does, the one nearest to it. The effort
-    of commands that are no ratios is that of their distance from rest, over the width of their bounds. Found by
-    sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact first and second derivatives: each
-    step is a small quadratic program in the commands. The search is local: where a target is reached in several ways,
-    or on several branches, give several `starts`, and the best answer is taken.
+    Of all commands that reach the target, it finds those of least effort `sum (1 - ratio)^2`; if none reach it, those
+    that come nearest. For a command that is not a ratio, the effort is its squared distance from rest over the squared
+    width of its bounds. The method is sequential quadratic programming (Nocedal and Wright 2006, ch. 18) with exact
+    first and second derivatives: each step is a small quadratic program in the commands. The search is local. Where a
+    target is reached in several ways, or on several branches, give several `starts`; the best answer is returned.
 
     Args:
         scene: with `m` tendons.
-        target: `()` or `(p,)`, what the measure should be.
+        target: `()` or `(p,)` value that the measure should have.
         measure: `(scene, x)` to `()` or `(p,)`, such as `tip_angle` (degrees), `tip_position` (length), or a
             function of your own at module level. Components are weighed as they are: scale those of different units.
         bounds: lowest and highest command, each `()` or `(m,)`; by default 0.4 and 1 for ratios of tendons.
-        starts: `(S, m)` commands to start from; by default those at rest, of tendons ratio 1.
-        tolerance: largest deviation from the target that counts as reached, in its unit: by default 1e-8, in
-            float32 1e-3.
-        max_solves: equilibria to solve at most, from each start.
+        starts: `(S, m)` commands to start from; by default those at rest, which are ratios of 1 for tendons.
+        tolerance: largest deviation from the target that counts as reached, in the unit of the target; by default 1e-8,
+            in float32 1e-3.
+        max_solves: largest number of equilibria to solve from each start.
         solver: settings of each solve.
         progress: called after each solve with the number of solves so far and the distance from the target.
 
     Returns:
-        A `Design` of status `REACHED`, or `UNREACHABLE`: then `value` is the nearest that was found, and `held` says
-        which bounds are in the way, or `NOT_CONVERGED`: also where no command has an effect on the measure, at the
-        start and as they are shortened.
+        A `Design`. If its status is `REACHED`, the target is met. If it is `UNREACHABLE`, `value` is the nearest value
+        that was found, and `held` says which bounds are in the way. Otherwise it is `NOT_CONVERGED`, also if no command
+        has an effect on the measure, neither at the start nor when shortened.
 
     `theta`, `solution` (as that of `equilibrium`), `value` and `loss` are differentiable in `target`, `bounds` and
-    every float of the scene, forward, reverse and to any order, by the conditions that an optimum satisfies (see
-    `jaxbeam.study.optimum`); not in `starts`. `history` is a record and does not move. The derivative is NaN where the
-    status is `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold
-    it, for it moves to one side only: so for a target that is met at rest, if ratio 1 is the upper bound.
+    every float of the scene, but not in `starts`: forward, reverse and to any order, by the optimality conditions (see
+    `jaxbeam.study.optimum`). `history` is a record without derivatives. The derivative is NaN where the status is
+    `NOT_CONVERGED`, where the optimum is not isolated, and where a command lies at a bound that does not hold it,
+    because it can move to one side only. An example of the last is a target that is met at rest, with ratio 1 as the
+    upper bound.
 
     Raises:
-        ValueError: if bounds are not `0 < low <= high`, or an argument has another shape, or as `equilibrium` does; or
-            inside `jit` or `vmap`, for the search is a loop on the host.
+        ValueError: if bounds are not `low <= high` in the range of the commands, an argument has another shape, as
+            `equilibrium` does, or if it is called inside `jit` or `vmap`: the search is a loop on the host.
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
@@ -106,10 +106,11 @@ def reach_each(
     solver: Newton = Newton(),
     progress: Callable[[int, float], None] | None = None,
 ) -> Design:
-    """Commands for each of a sequence of targets `(T,)` or `(T, p)`, each started from the answer before.
+    """Commands for each of a sequence of targets `(T,)` or `(T, p)`, such as points of a path that the tip draws.
 
-    So a tip draws a path: neighbouring targets take few solves each. The first is found as by `reach`. Arguments,
-    errors, answer and derivatives are those of `reach`, with leading axis `T`; `progress` counts the solves of all.
+    The search for each target starts from the answer before, so neighbouring targets take few solves each. The first is
+    found as by `reach`. Arguments, errors, answer and derivatives are those of `reach`, with leading axis `T`.
+    `progress` counts the solves of all targets.
     """
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
@@ -161,7 +162,9 @@ def _problem(
     low, high = ends
     least = np.concatenate([np.full(term.command_count, term.kind.commands.low) for term in commanded_terms(scene)])
     if is_concrete(low, high) and not ((np.asarray(low) > least) & (np.asarray(low) <= np.asarray(high))).all():
-        raise ValueError(f"bounds: expected 0 < low <= high, got low {low.tolist()} and high {high.tolist()}")
+        floor = f"{least[0]:g}" if np.all(least == least[0]) else f"{least.tolist()}"
+        above = "" if np.isneginf(least).all() else f"{floor} < "
+        raise ValueError(f"bounds: expected {above}low <= high, got low {low.tolist()} and high {high.tolist()}")
     begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
@@ -170,7 +173,7 @@ def _problem(
 
 
 def _known_or_traced(name: str, target: Numbers) -> Any:
-    """Targets, checked. A traced one may be NaN: its search fails, and harms the derivative of no other."""
+    """Targets, checked. A traced one may be NaN: its search fails, and the derivatives of others are unharmed."""
     return checks.numbers(name, target) if is_concrete(target) else checks.real(name, target)
 
 
@@ -185,7 +188,7 @@ def _shape(measure: Measure, scene: Scene) -> tuple[int, ...]:
 
 @partial(jax.jit, static_argnames=("measure", "solver"))
 def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
-    """The design as a function of the problem and the target. `history` and whole numbers do not move."""
+    """The design, differentiable in the problem and the target, except for `history` and whole numbers."""
     answer = Answer(
         theta=found.theta,
         x=found.solution.x,
@@ -197,8 +200,8 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
     miss = jnp.ravel(value - target)
     moving = answer.trusted & (found.loss != 0)
     distance = jnp.linalg.norm(jnp.where(moving, miss, 1))
-    # At zero the distance has no slope, and stays. Of a failed search its slope is NaN, as that of `theta` is, and not
-    # by way of a distance that may be NaN itself: zero times that would reach a loss that does not look at it.
+    # A distance of zero has no derivative and gets zero. A failed search gets the NaN derivative of `theta`, and not
+    # that of the distance, which may be NaN itself: zero times NaN would reach a loss that does not depend on it.
     failed = found.loss + jnp.sum(theta - lax.stop_gradient(theta))
     loss = jnp.where(moving, distance, jnp.where(answer.trusted, 0 * jnp.sum(miss), failed))
     return replace(found, theta=theta, solution=solution, value=value, loss=loss)
@@ -206,7 +209,8 @@ def _moving(problem: Problem, target: jax.Array, found: Design, measure: Measure
 
 @partial(jax.jit, static_argnames=("measure", "solver"))
 def _moving_each(problem: Problem, targets: jax.Array, found: Design, measure: Measure, solver: Newton) -> Design:
-    # Factors are not kept, as in `differentiable_rows`.
+    """`_moving` for each of the targets `(T, ...)`."""
+    # As in `differentiable_rows`, factors are made anew for each row instead of stored for all.
     each = jax.checkpoint(lambda row: _moving(problem, *row, measure, solver))
     return lax.map(each, (targets, found))
 
@@ -223,10 +227,10 @@ def _on_host(
     solver: Newton,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[Task, np.ndarray, np.ndarray]:
-    """What is searched for, without a target, the targets `(T, ...)` and the starts `(S, m)`, as numbers of the host.
+    """The task (its target still empty), the targets `(T, ...)` and the starts `(S, m)`, with values on the host.
 
     Raises:
-        ValueError: if a value is traced by more than derivatives.
+        ValueError: if a value is traced by anything but derivatives.
     """
     values = problem, targets, begin
     if not is_concrete(*jax.tree.leaves(values)):
@@ -258,7 +262,7 @@ def _on_host(
 
 
 def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[Design]:
-    """The design of each target `(T, ...)`, searched from the answer before."""
+    """The design of each of the targets `(T, ...)`. Each search but the first starts from the answer before."""
     before: Trial | None = None
     designs = []
     for target in targets:
@@ -274,7 +278,7 @@ def _search_all(task: Task, begin: np.ndarray) -> SearchState:
     found = [_search_twice(task, theta) for theta in begin]
 
     def rank(state: SearchState) -> tuple[bool, float, float]:
-        """The nearest is best; among those that reach the target the one of least effort."""
+        """Sort key: the nearest answer is best; among those that reach the target, the one of least effort."""
         if state.here is None:
             return True, np.inf, np.inf
         nearness = -1.0 if state.status == DesignStatus.REACHED else state.here.distance
@@ -284,10 +288,10 @@ def _search_all(task: Task, begin: np.ndarray) -> SearchState:
 
 
 def _search_twice(task: Task, theta: np.ndarray) -> SearchState:
-    """A search from the commands `theta` `(m,)` at rest, and another one from its answer if that is out of reach.
+    """A search from the commands `theta` `(m,)`, and if the target is out of reach, a second one from its answer.
 
-    The second approaches the answer from rest: the first may have come to it by way of a state that a beam pulled
-    straight to it does not take.
+    The second search approaches the commands of that answer straight from rest. The first one came to them by way of
+    other commands, and its state may be one that a beam pulled straight to them does not take.
     """
     found = search(task, theta)
     if found.status != DesignStatus.UNREACHABLE or found.here is None:
@@ -303,7 +307,7 @@ def _search_twice(task: Task, theta: np.ndarray) -> SearchState:
 def _design(task: Task, state: SearchState, shape: tuple[int, ...]) -> Design:
     """The report of a search, with a value of this `shape`."""
     dtype, most = task.scene.mesh.nodes.dtype, task.max_solves
-    # Without any equilibrium, the one that failed.
+    # If no trial was accepted, report the last one.
     at = state.last if state.here is None else state.here
     assert at is not None
     miss = at.miss if state.here is not None else np.full(at.miss.shape, np.inf)

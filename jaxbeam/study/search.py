@@ -1,8 +1,8 @@
 """Sequential quadratic programming for commands: the search under `reach`, on the host.
 
-Of all commands within bounds at which a measure of the equilibrium meets its target, find the one of least effort
-(Nocedal and Wright 2006, Numerical Optimization, ch. 18). Each turn of the loop runs two compiled programs: the solve
-of `equilibrium`, and the expansion of the measure from the factor of that solve. What decides between them is NumPy.
+Of all commands within bounds at which a measure of the equilibrium meets its target, find those of least effort
+(Nocedal and Wright 2006, Numerical Optimization, ch. 18). Each iteration runs two compiled programs: the solve of
+`equilibrium`, and the expansion of the measure with the factor of that solve. Everything between them is NumPy.
 """
 
 from __future__ import annotations
@@ -25,19 +25,26 @@ from jaxbeam.study.design import DesignStatus
 from jaxbeam.study.expansion import Measure, expand_measure
 from jaxbeam.study.quadratic import Program, best_step, softness
 
-# The largest change of a ratio in one step, and the change that counts as rest: as steps converge quadratically, the
-# answer is within about its square.
+# Largest radius of the trust region: the largest change of a ratio in one step.
 RADIUS = 0.3
-
-
+# Largest change that counts as converged. Steps converge quadratically, so the answer is within about its square.
 REST = 1e-6
 
 
 class Task(NamedTuple):
     """What is searched for, in NumPy arrays of float64. Commands, also those of trials, are in multiples of `unit`.
 
-    unit: `(m,)` of each command. rest: `(m,)` commands of no effort.
-    target: `(p,)`. low, high: `(m,)` bounds. tolerance: largest deviation that counts as reached.
+    scene: under any commands.
+    layout: of its stiffness.
+    unit: `(m,)` unit of each command.
+    rest: `(m,)` commands of no effort.
+    target: `(p,)` value that the measure should have.
+    low: `(m,)` lower bounds of the commands.
+    high: `(m,)` upper bounds.
+    tolerance: largest deviation from the target that counts as reached.
+    measure: `(scene, x)` to `()` or `(p,)`.
+    max_solves: largest number of equilibria to solve.
+    solver: settings of each solve.
     report: called after each solve with the distance from the target.
     """
 
@@ -56,9 +63,15 @@ class Task(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A command that was solved, and the measure around it.
+    """Commands that were solved, and the measure around them. Derivatives are by commands in multiples of `Task.unit`.
 
-    theta: `(m,)`. value: `(p,)` of the measure. slope, bend, drift: as in `Expansion`.
+    task: that it belongs to.
+    theta: `(m,)` commands.
+    solution: their equilibrium.
+    value: `(p,)` of the measure.
+    slope: `(p, m)` as in `Expansion`.
+    bend: `(p, m, m)` as in `Expansion`.
+    drift: `(n, 2, m)` as in `Expansion`.
     """
 
     task: Task
@@ -76,12 +89,12 @@ class Trial(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """How far the measure is from the target."""
+        """Euclidean distance of the measure from the target."""
         return float(np.linalg.norm(self.miss))
 
     @property
     def deviation(self) -> float:
-        """Largest deviation of a component of the measure."""
+        """Largest deviation of a component of the measure from the target."""
         return float(np.max(np.abs(self.miss)))
 
     @property
@@ -91,20 +104,27 @@ class Trial(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether it can be gone on from."""
+        """Whether the search can continue from it: status `OK` and finite derivatives."""
         return int(self.solution.status) == 0 and bool(np.isfinite(self.slope).all() and np.isfinite(self.bend).all())
 
 
 @dataclasses.dataclass
 class SearchState:
-    """Where a search is. `step`, `held`, `seen` are `(m,)`.
+    """The state of a search.
 
-    last: the trial made last. here: the last one that was accepted; None before the first.
-    step: to try next. held: the bounds that hold it, as in `Design`. radius: largest change of a ratio in a step.
-    funnel: how far from the target a step may lead that goes away from it. scale: largest squared slope so far.
-    seen: commands of which an effect was seen, or that were shortened as far as they go.
-    probing: the step looks for an effect of commands that have none. resting: the search has converged.
-    solves: equilibria solved. tried: theta, distance and status of each of them.
+    step: `(m,)` to try next.
+    held: `(m,)` the bounds that hold the step, as in `Design`.
+    seen: `(m,)` whether an effect of the command was seen, or the command was shortened to its lower bound.
+    last: the latest trial.
+    here: the latest trial that was accepted; None before the first.
+    radius: of the trust region: largest change of a ratio in a step.
+    funnel: largest distance from the target for a trial that is accepted although it is farther from it.
+    scale: largest squared norm of a slope so far.
+    probing: whether the step looks for an effect of commands that have none.
+    resting: whether the search has converged.
+    solves: number of equilibria solved.
+    tried: commands, distance and status of each trial.
+    status: how the search ends.
     """
 
     step: np.ndarray
@@ -123,10 +143,14 @@ class SearchState:
 
 
 def search(task: Task, start: np.ndarray | Trial) -> SearchState:
-    """Sequential quadratic programming from a command `(m,)`, approached from rest, or from a trial of another target.
+    """Search by sequential quadratic programming.
 
-    A command that has no effect, to first or second order, may have one elsewhere: a tendon that is slack, or a measure
-    that is flat. Where the search would end short of the target, such commands are shortened until an effect is seen.
+    A command without an effect, to first and second order, may have one elsewhere: its tendon may be slack here, or the
+    measure flat. If the search would end short of the target, such commands are shortened until an effect is seen.
+
+    Args:
+        task: what to search for.
+        start: commands `(m,)`, which are approached from rest, or the trial of another target to start from.
     """
     m = task.rest.size
     state = SearchState(step=np.zeros(m), held=np.zeros(m, np.int32), seen=np.zeros(m, bool))
@@ -146,24 +170,27 @@ def search(task: Task, start: np.ndarray | Trial) -> SearchState:
 
 
 def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
-    """The equilibrium of the command `theta`, approached from `before` along its drift, and the measure around it."""
+    """The equilibrium under commands `theta` `(m,)`, and the measure around it.
+
+    The solve is approached from the trial `before`, along its drift, or from rest if there is none.
+    """
     dtype, linear = task.scene.mesh.nodes.dtype, task.solver.linear
-    theta, here = theta.astype(dtype), (theta * task.unit).astype(dtype)
-    scene = unlock(command(task.scene, here))
+    theta, commands = theta.astype(dtype), (theta * task.unit).astype(dtype)
+    scene = unlock(command(task.scene, commands))
     if before is None:
         origin = from_rest(scene)
     else:
         ahead = before.drift @ (theta - before.theta)
         origin = from_neighbour((before.theta * task.unit).astype(dtype), before.solution.x, ahead.astype(dtype))
     solution, factor = solve_from(origin, scene, task.layout, task.solver)
-    around = expand_measure(task.scene, task.layout, here, solution.x, factor, task.measure, linear)
+    around = expand_measure(task.scene, task.layout, commands, solution.x, factor, task.measure, linear)
     value, slope, bend, drift = (each.astype(float) for each in jax.device_get(around))
     slope, bend, drift = slope * task.unit, bend * task.unit * task.unit[:, None], drift * task.unit
     return Trial(task, theta.astype(float), solution, value, slope, bend, drift)
 
 
 def _tried(task: Task, state: SearchState, theta: np.ndarray, before: Trial | None) -> Trial:
-    """A new trial, recorded."""
+    """Solve a new trial, and record it in the state."""
     trial = solve_trial(task, theta, before)
     state.solves += 1
     state.tried.append((trial.theta, trial.distance, int(trial.solution.status)))
@@ -172,15 +199,15 @@ def _tried(task: Task, state: SearchState, theta: np.ndarray, before: Trial | No
 
 
 def _judge(task: Task, state: SearchState, new: Trial) -> None:
-    """Accept the new trial or not."""
+    """Accept or reject the new trial, and update the trust region and the funnel."""
     old = state.here
-    # Where commands have no effect there is nothing to follow: what they were shortened to is a start like any.
+    # A probing step changes commands that have no effect, so there is nothing to compare: its trial is a new start.
     first = old is None or state.probing
-    # Nearer to the target, or no farther than solves can tell; or cheaper, and not too far from it, which is allowed
-    # less and less.
+    # Accept a trial that is nearer to the target, or as near up to the accuracy of the solves. Accept also one of less
+    # effort within the funnel, which narrows each time.
     nearer = old is None or new.distance <= old.distance + 0.1 * task.tolerance
     cheaper = old is not None and new.distance <= state.funnel and new.effort < old.effort
-    # Where all commands had an effect somewhere, one at which none has any is a step too far.
+    # If all commands had an effect somewhere and none has one at the new trial, the step was too long.
     lost = old is not None and state.seen.all() and effects(task, old).any() and not effects(task, new).any()
     lost = lost and new.deviation > task.tolerance
     taken = new.good and (first or nearer or cheaper) and not lost
@@ -198,7 +225,7 @@ def _judge(task: Task, state: SearchState, new: Trial) -> None:
 
 
 def _plan(task: Task, state: SearchState) -> None:
-    """The step to try next, and whether the search rests."""
+    """Set the step to try next, and whether the search has converged."""
     here, radius = state.here, state.radius
     assert here is not None
     room, above = here.theta - task.low, task.high - here.theta
@@ -218,7 +245,7 @@ def _plan(task: Task, state: SearchState) -> None:
 
 
 def effects(task: Task, at: Trial) -> np.ndarray:
-    """Which commands `(m,)` have an effect on the measure, to first or second order: more than its round-off."""
+    """Which commands, `(m,)`, have an effect on the measure above its round-off, to first or second order."""
     eps = np.finfo(task.scene.mesh.nodes.dtype).eps
     round_off = eps * (np.abs(task.target) + np.abs(at.miss))
     most = np.maximum(np.abs(at.slope), np.max(np.abs(at.bend), axis=2))
@@ -226,9 +253,10 @@ def effects(task: Task, at: Trial) -> np.ndarray:
 
 
 def _status(task: Task, state: SearchState) -> DesignStatus:
+    """The status of the design that a search ended with."""
     if not state.resting or state.here is None:
         return DesignStatus.NOT_CONVERGED
     if state.here.deviation <= task.tolerance:
         return DesignStatus.REACHED
-    # Without any effect of any command there is no telling what is in reach.
+    # If no command has an effect, it is unknown what can be reached.
     return DesignStatus.UNREACHABLE if effects(task, state.here).any() else DesignStatus.NOT_CONVERGED

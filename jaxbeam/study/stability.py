@@ -24,22 +24,22 @@ from jaxbeam.scene.scene import Scene, placed, stencil_hessians
 from jaxbeam.solve.implicit import energy_gradient
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 
-# Subspace iteration: extra vectors beside the wanted ones, and the most turns it may take.
+# Subspace iteration: number of vectors beyond the wanted ones, and largest number of iterations.
 GUARD = 4
-
-
 MAX_TURNS = 300
-
-
-# Eigenvalues nearer to each other than this many times their round-off have no derivative that can be told.
+# Eigenvalues closer to each other than this many times their round-off do not count as simple: their derivative is NaN.
 SEPARATE = 100.0
 
 
 @pytree
 class Modes:
-    """The lowest modes of a state. `values`: `(count,)` eigenvalues, ascending (force / length). `shapes`:
-    `(count, n, 2)` nodal displacements of unit Euclidean norm, zero where fixed; the largest component is positive.
-    `negative`: `()` how many eigenvalues of the whole stiffness are negative."""
+    """The lowest modes of a state.
+
+    values: `(count,)` eigenvalues, ascending (force / length).
+    shapes: `(count, n, 2)` nodal displacements of unit Euclidean norm, zero where fixed. The component of largest
+        magnitude is positive.
+    negative: `()` number of negative eigenvalues of the whole stiffness.
+    """
 
     values: jax.Array
     shapes: jax.Array
@@ -51,16 +51,16 @@ def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newto
     """The lowest eigenvalues of the tangent stiffness at `x`, and their shapes.
 
     Args:
-        scene: with its command.
+        scene: under its commands.
         x: `(n, 2)` node positions, an equilibrium or not.
-        count: how many modes.
+        count: number of modes.
         solver: its linear solver is used.
 
     Returns:
-        `Modes`. A first eigenvalue that is negative means that an equilibrium `x` is unstable.
+        `Modes`. If `x` is an equilibrium and the first eigenvalue is negative, it is unstable.
 
-    `values` are differentiable in every float of the scene and in `x`, forward and reverse, once. The derivative is NaN
-    where an eigenvalue is not simple, to round-off. So are second derivatives and those of `shapes`.
+    `values` are differentiable once in every float of the scene and in `x`, forward and reverse. The derivative is NaN
+    where an eigenvalue is not simple up to round-off. Second derivatives and those of `shapes` are NaN.
 
     Raises:
         ValueError: if `count` is not between 1 and the number of free coordinates, or `x` has another shape.
@@ -94,7 +94,7 @@ def _lowest_mode(
 def _follow_modes(
     scene: Scene, x: jax.Array, values: jax.Array, shapes: jax.Array, simple: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """`values` and `shapes` themselves, which move with the scene and with `x`. Their own tangents are ignored."""
+    """`values` and `shapes`, with derivatives in the scene and in `x` attached. Their own tangents are ignored."""
     return values, shapes
 
 
@@ -102,7 +102,7 @@ def _follow_modes(
 def _follow_modes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     """With a unit eigenvector `v` of a simple eigenvalue, `d lambda = v . dK v`.
 
-    `dv` would take a solve with a singular matrix; it is NaN, and with it the second derivative of `lambda`.
+    `dv` would take a solve with a singular matrix. It is set to NaN, and so the second derivative of `lambda` is NaN.
     """
     scene, x, _, _, simple = primals
     values, shapes = _follow_modes(*primals)
@@ -116,7 +116,7 @@ def _follow_modes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _unless(good: jax.Array, change: jax.Array) -> jax.Array:
-    """A change, linearly; NaN unless it is good or zero. A cotangent of zero stays zero."""
+    """`change` if it is good or zero, else NaN; linear in it, so that a cotangent of zero stays zero."""
 
     def solve(_: Any, b: jax.Array) -> jax.Array:
         return jnp.where(good | jnp.all(b == 0), b, jnp.nan)
@@ -128,18 +128,21 @@ _moving_modes = jax.jit(_follow_modes)
 
 
 def lowest_pairs(layout: Layout, storage: jax.Array, count: int, linear: LinearSolver) -> tuple[jax.Array, ...]:
-    """Lowest eigenvalues `(count,)` and unit eigenvectors `(N, count)` of an assembled matrix, and which eigenvalues
-    `(count,)` are simple: no other one that was iterated is as near as round-off.
+    """Lowest eigenpairs of an assembled matrix, by inverse subspace iteration (Bathe 1973).
 
-    Inverse subspace iteration (Bathe 1973) on the Cholesky factor, of the matrix shifted by as little as makes
-    it positive definite, until the eigenvalues stand still.
+    It uses the Cholesky factor of the matrix, shifted by just enough to make it positive definite, and ends when the
+    eigenvalues no longer change.
+
+    Returns:
+        Eigenvalues `(count,)`, unit eigenvectors `(N, count)`, and which eigenvalues are simple, `(count,)`: those that
+        differ from every other one of the iteration by more than round-off.
     """
     stiffness = jnp.max(jnp.abs(storage[layout.diagonal]))
     eps = jnp.finfo(storage.dtype).eps
 
     def grow(carry: Any) -> Any:
         tries, _, _, _ = carry
-        # Quarter decades from far below any stiffness that matters.
+        # Try no shift first, then shifts a quarter of a decade apart, from far below any stiffness that matters.
         shift = jnp.where(tries > 0, stiffness * eps * 10.0 ** (1 + tries / 4), 0).astype(storage.dtype)
         factor, done = linear.factor(layout, storage.at[layout.diagonal].add(shift))
         return tries + 1, shift, factor, done
@@ -162,7 +165,7 @@ def lowest_pairs(layout: Layout, storage: jax.Array, count: int, linear: LinearS
     width = min(count + GUARD, layout.slots.size)
     vectors = jnp.where(unknown, jax.random.normal(jax.random.key(0), (layout.slots.size, width), storage.dtype), 0)
     begin = (jnp.zeros((), jnp.int32), jnp.zeros(width, storage.dtype), jnp.asarray(jnp.inf, storage.dtype), vectors)
-    # Round-off of the factor's entries is eps * stiffness; nothing below it can be told from zero.
+    # The round-off of the factor's entries is eps * stiffness. A value below it cannot be told from zero.
     round_off = lambda values: eps * (100 * jnp.abs(values[0]) + stiffness)
     going = lambda c: (c[0] < MAX_TURNS) & ~(c[2] <= round_off(c[1]))
     _, values, _, vectors = lax.while_loop(going, turn, begin)
