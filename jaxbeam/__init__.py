@@ -34,6 +34,7 @@ from jaxbeam.physics.tendon import constant_stiffness as constant_stiffness
 from jaxbeam.physics.tendon import inverse_square_stiffness as inverse_square_stiffness
 from jaxbeam.physics.tendon import inverse_stiffness as inverse_stiffness
 from jaxbeam.physics.tendon import tendons as tendons
+from jaxbeam.physics.weight import weight as weight
 from jaxbeam.scene.beams import rod_beam as rod_beam
 from jaxbeam.scene.beams import tendon_beam as tendon_beam
 from jaxbeam.scene.measures import cauchy_stress as cauchy_stress

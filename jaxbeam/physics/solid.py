@@ -18,7 +18,7 @@ from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.physics import quadrature
 from jaxbeam.physics.energy import Energy, Term
 from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
-from jaxbeam.physics.quadrature import Density, SolidParams
+from jaxbeam.physics.quadrature import Density, SolidParams, mapped
 from jaxbeam.physics.volume import admissible_step, rest_is_sound, smallest_ratios
 
 # An element under this `J` is let through zero, where its energy allows that: held back, it would be approached in ever
@@ -126,15 +126,6 @@ def solid(
 
     material = jax.tree_util.tree_map_with_path(per_element, params)
     check_density(density, material)
-    rest = xp.asarray(mesh.nodes)[mesh.elements]
-    points, shares = element.rule(element.degree if degree is None else checks.count("degree", degree, 1))
-    # How an element is mapped from the reference one, and the inverse of that, at each point.
-    slopes = xp.asarray(element.slopes(points), dtype)
-    # From the first node, so that a place far from the origin costs no digits.
-    map_ = xp.einsum("mkd,qki->mqdi", rest - rest[:, :1], slopes)
-    determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
-    inverse = xp.stack([map_[..., 1, 1], -map_[..., 0, 1], -map_[..., 1, 0], map_[..., 0, 0]], axis=-1)
-    inverse = inverse.reshape(map_.shape) / determinant[..., None, None]
-    gradients = xp.einsum("qki,mqid->mqkd", slopes, inverse)
-    weights = element.area * xp.asarray(shares, dtype) * determinant
+    degree = element.degree if degree is None else checks.count("degree", degree, 1)
+    rest, gradients, weights = mapped(mesh.nodes, mesh.elements, degree)
     return Term(SolidEnergy(density), mesh.elements, SolidParams(rest, gradients, weights, material))

@@ -1,0 +1,75 @@
+"""Weight: a force on every piece of area, such as gravity, which keeps its size and direction.
+
+On the nodes of an element it acts as its shape functions share it out: `f_a = force int N_a dA`. Six-node triangles
+carry it at the nodes between corners alone. Source: Zienkiewicz and Taylor, "The Finite Element Method", vol. 1, 2000,
+section 2.3.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace
+from jaxbeam.mesh.elements import element_of
+from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.physics.energy import Energy, Term
+from jaxbeam.physics.quadrature import mapped
+
+
+@pytree
+class WeightParams:
+    """Of each element: rest positions `(m, k, 2)`, share of the area `(m, k)` of each node, and `force` `(m, 2)`."""
+
+    rest: jax.Array
+    shares: jax.Array
+    force: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightEnergy(Energy):
+    """`- force . sum_a (int N_a dA) (x_a - X_a)`: the potential of a constant force on the area of one element."""
+
+    name: ClassVar[str] = "weight"
+    coordinates: ClassVar[int | None] = 2
+
+    def __call__(self, x: jax.Array, params: WeightParams) -> jax.Array:
+        return -jnp.sum(params.shares[:, None] * (x - params.rest) * params.force)
+
+    def partway(self, params: WeightParams, share: jax.Array) -> WeightParams:
+        return replace(params, force=share * params.force)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        return weight(mesh, np.repeat(np.asarray(term.params.force), parts, axis=0))
+
+
+@usual_rules
+def weight(mesh: Mesh, force: Numbers) -> Term:
+    """A constant force on all area of a body, such as its density times gravity.
+
+    Args:
+        mesh: of triangles; differentiable in its nodes.
+        force: per area at rest (thickness 1), `(2,)` everywhere or `(t, 2)` on each element, such as
+            `[0, -density * 9.81]`; differentiable.
+
+    Raises:
+        ValueError: if `force` has another shape or is not finite, or the mesh is the line of a rod.
+    """
+    check_triangles(mesh)
+    count = len(mesh.elements)
+    force = checks.numbers("force", force, shapes=((2,), (count, 2)))
+    xp, dtype = namespace(mesh.nodes, force), mesh.nodes.dtype
+    element = element_of(mesh.elements)
+    # The shape functions times the determinant of a curved element are of degree 4.
+    degree = max(element.rules)
+    rest, _, weights = mapped(mesh.nodes, mesh.elements, degree)
+    shares = weights @ xp.asarray(element.shape(element.rule(degree)[0]), dtype)
+    return Term(
+        WeightEnergy(), mesh.elements, WeightParams(rest, shares, xp.broadcast_to(xp.asarray(force, dtype), (count, 2)))
+    )
