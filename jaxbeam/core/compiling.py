@@ -26,14 +26,15 @@ def zeros_like_result(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def compute_if(condition: jax.Array | bool, compute: Callable[..., T], otherwise: T, *arguments: Any) -> T:
-    """`compute(*arguments)` if the condition holds; else `otherwise`, at no cost.
+    """`compute(*arguments)` if the condition holds; else `otherwise`, and nothing is computed.
 
-    This is a loop of at most one iteration instead of `lax.cond`: under `vmap` a cond becomes a select, which computes
-    both sides in every lane.
+    This is a loop of at most one iteration instead of `lax.cond`: under `vmap` a cond becomes a select, which always
+    computes both sides. Under `vmap` the loop is skipped if the condition holds in no lane. It cannot be differentiated
+    in reverse mode.
 
     Args:
         condition: `()` traced boolean, or a Python boolean, which is decided while tracing.
-        compute: a function that depends on its arguments alone.
+        compute: a function. XLA may compute in advance what it makes of traced values that are not `arguments`.
         otherwise: a tree with the structure, shapes and dtypes of the result of `compute`.
         arguments: the arguments of `compute`.
     """
@@ -41,9 +42,10 @@ def compute_if(condition: jax.Array | bool, compute: Callable[..., T], otherwise
         return compute(*arguments) if condition else otherwise
 
     def iteration(carry: tuple[T, jax.Array]) -> tuple[T, jax.Array]:
-        # Without the barrier XLA moves operations that do not depend on the carry out of the loop: they always run.
+        # The barrier makes the arguments depend on the carry. XLA would move operations that do not depend on it out of
+        # the loop, and then they would run even if the loop does not.
         _, inside = lax.optimization_barrier((carry, arguments))
-        return compute(*inside), jnp.zeros((), bool)
+        return compute(*inside), jnp.zeros((), bool)  # False: stop after this iteration
 
     return lax.while_loop(lambda carry: carry[1], iteration, (otherwise, condition))[0]
 

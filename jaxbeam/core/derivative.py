@@ -1,9 +1,9 @@
 """Functions with a derivative rule of their own, to any order and under every transformation.
 
-`jax.custom_jvp` fails for a rule that calls its own function again, as the rule of an implicit function does. In
-reverse mode under `lax.map`, `lax.scan` or `jax.checkpoint`, JAX partially evaluates the body. It then keeps the
-operations of the rule and drops the rule itself. A second differentiation differentiates the code of the inner call
-instead of using its rule, and second derivatives are silently wrong. A primitive keeps its rule.
+The rule of an implicit function calls that function again, to be differentiated again. With `jax.custom_jvp` such
+second derivatives are silently wrong in reverse mode under `lax.map`, `lax.scan` or `jax.checkpoint`: JAX replaces the
+inner call by its operations, and then differentiates these instead of asking for the rule. A primitive of JAX keeps its
+rule, so each function here becomes a primitive of its own.
 """
 
 from __future__ import annotations
@@ -82,22 +82,29 @@ class custom_derivative(Generic[T]):
     def _differentiated(
         self, primals: Sequence[Any], tangents: Sequence[Any], static: tuple[Any, ...], tree: Any, axes: Axes
     ) -> tuple[list[Any], list[Any]]:
-        moving = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
+        """The rule, as JAX asks a primitive for it: values and tangents of the result, leaf by leaf.
+
+        A tangent that JAX knows to be zero is no array (`ad.Zero`). `moving` are the leaves with another tangent. Under
+        each level of `jax.vmap` a tangent is mapped along the same axis as its leaf.
+        """
+        if self.rule is None:
+            raise TypeError(f"{self.primitive.name}: it has no derivative rule; set one with defjvp")
+        rule, moving = self.rule, [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
         count = len(primals)
 
         @usual_rules
-        def both(*leaves: jax.Array) -> list[jax.Array]:
+        def value_and_change(*leaves: jax.Array) -> list[jax.Array]:
             values, changes = leaves[:count], [_zero_tangent(leaf) for leaf in leaves[:count]]
             for k, tangent in zip(moving, leaves[count:], strict=True):
                 changes[k] = tangent
             unflatten = functools.partial(jax.tree.unflatten, tree)
-            assert self.rule is not None
-            value, change = self.rule(*static, unflatten(values), unflatten(changes))
+            value, change = rule(*static, unflatten(values), unflatten(changes))
             return [*jax.tree.leaves(value), *jax.tree.leaves(change)]
 
         along = tuple((*level, *(level[k] for k in moving)) for level in axes)
-        found = _mapped(both, along)(*primals, *(tangents[k] for k in moving))
-        return found[: len(found) // 2], found[len(found) // 2 :]
+        found = _mapped(value_and_change, along)(*primals, *(tangents[k] for k in moving))
+        half = len(found) // 2  # a value and its change have the same leaves
+        return found[:half], found[half:]
 
     def _batched(
         self, leaves: Sequence[Any], dims: Sequence[Any], static: tuple[Any, ...], tree: Any, axes: Axes

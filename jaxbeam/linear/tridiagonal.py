@@ -78,8 +78,10 @@ class BlockTridiagonal:
         (pivot, beside), corner = _eliminate_blocks(layout, storage, eliminate)
         r = len(corner)
         corner = jnp.linalg.cholesky(corner, symmetrize_input=False) if r else corner
-        # A block that fails is NaN. The NaN spreads to the border, but not to blocks that are coupled to no other.
-        ok = jnp.isfinite(corner[-1, -1]) if r else jnp.all(jnp.isfinite(pivot[:, -1, -1]))
+        # A block that fails is NaN. The NaN spreads to the blocks after it and to the border, unless no block is coupled
+        # to another.
+        last = corner[None] if r else pivot[-1:] if layout.blocks[2] else pivot
+        ok = jnp.all(jnp.isfinite(last[:, -1, -1]))
         return BorderedFactor(pivot, beside, corner), ok
 
     def pivots(self, layout: Layout, factor: BorderedFactor) -> jax.Array:

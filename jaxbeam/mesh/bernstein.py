@@ -1,9 +1,9 @@
 """Quadratic polynomials on a triangle in Bernstein form, and their smallest values.
 
 A polynomial is `sum_i c_i B_i` with `B = (l0^2, l1^2, l2^2, 2 l0 l1, 2 l1 l2, 2 l2 l0)` in the barycentric coordinates
-`l`. Its coefficients `(6, ...)` are the values at the corners, and one for each edge of `EDGES`. The
-`B_i` are positive and sum to 1, so the polynomial is nowhere less than its smallest coefficient. Its smallest value may
-be well above that. Source: Farin, "Curves and Surfaces for CAGD", 2002, chapter 17.
+`l`. The first three of its coefficients `(6, ...)` are its values at the corners. The last three belong to the edges of
+`EDGES`. The `B_i` are not negative and sum to 1, so the smallest coefficient is a lower bound of the polynomial. Its
+smallest value may be well above that bound. Source: Farin, "Curves and Surfaces for CAGD", 2002, chapter 17.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-# The corners that the edges of a triangle lie between.
+# The two corners of each edge of a triangle.
 EDGES = ((0, 1), (1, 2), (2, 0))
 
 
 def array_module(c: Any) -> Any:
-    """NumPy for its own arrays, so that a mesh is checked on the host, else `jax.numpy`."""
+    """NumPy if `c` is a NumPy array, so that a mesh is checked on the host; else `jax.numpy`."""
     return np if isinstance(c, np.ndarray) else jnp
 
 
 def basis(place: Any) -> Any:
-    """The values `(6, ...)` of `B` at a place `(3, ...)`."""
+    """The values `(6, ...)` of `B` at points with barycentric coordinates `place` `(3, ...)`."""
     xp = array_module(place)
     return xp.stack([place[a] * place[a] for a in range(3)] + [2 * place[a] * place[b] for a, b in EDGES])
 
 
 def minimiser(c: Any) -> Any:
-    """Where `(3, ...)` on the triangle the polynomial with coefficients `c` `(6, ...)` is smallest.
+    """The point `(3, ...)` of the triangle at which the polynomial with coefficients `c` `(6, ...)` is smallest.
 
-    That is where it is stationary inside, or along an edge, or at a corner. Differentiable wherever the place moves
-    smoothly.
+    It is a stationary point inside, a stationary point along an edge, or a corner. Differentiable where the point moves
+    smoothly with the coefficients.
     """
     xp = array_module(c)
     value = lambda place: (c * basis(place)).sum(axis=0)
@@ -46,7 +46,10 @@ def minimiser(c: Any) -> Any:
 
 
 def _on_edge(c: Any, edge: int, a: int, b: int) -> Any:
-    """Where it is smallest on the edge from corner `a` to `b`; `a` where it is not smallest in between."""
+    """The point between corners `a` and `b` at which the polynomial is smallest on their edge.
+
+    Corner `a` if the polynomial is smallest at an end of the edge.
+    """
     xp = array_module(c)
     at_a, at_b = c[a] - c[edge], c[b] - c[edge]
     between = (at_a > 0) & (at_b > 0)
@@ -57,9 +60,9 @@ def _on_edge(c: Any, edge: int, a: int, b: int) -> Any:
 
 
 def _inside(c: Any) -> Any:
-    """Where it is stationary; corner 0 if that is outside the triangle or not a minimum.
+    """The stationary point of the polynomial; corner 0 if that point is outside the triangle or not a minimum.
 
-    With `y = (l1, l2)` it is `c0 + 2 g y + y D y`, so `D y = -g`, by Cramer's rule.
+    With `y = (l1, l2)` the polynomial is `c0 + 2 g y + y D y`. Cramer's rule solves `D y = -g`.
     """
     xp = array_module(c)
     g1, g2, rise = c[3] - c[0], c[5] - c[0], c[4] - c[3]

@@ -1,7 +1,7 @@
-"""What an element is: one record with all that meshes, energies, measures and pictures ask of it.
+"""A kind of element: one record with all that meshes, energies, measures and pictures need to know of it.
 
-A point of an element with `c` corners is given by the weights `(c,)` of its corners. They add up to 1: on a triangle
-they are the barycentric coordinates.
+A point of an element with `c` corners is given by weights `(c,)` of the corners, of sum 1. On a triangle they are the
+barycentric coordinates.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from jaxbeam.core.derivative import custom_derivative
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Determinant:
-    """The determinant of the map from the reference element: a polynomial with `b` coefficients.
+    """The Jacobian determinant of the map from the reference element: a polynomial with `b` coefficients.
 
-    Its mean is the area of the element over that of the reference element. The functions take NumPy or JAX arrays with
-    elements on the last axes.
+    Its mean is the area of the element over that of the reference element. The functions take NumPy or JAX arrays. The
+    last axes of these are the elements.
 
-    slopes: of a map with nodes `(k, 2, ...)`, in whatever form `coefficients` takes them.
-    coefficients: from the slopes of two maps, the coefficients `(b, ...)` of the determinant made of the first slope of
-        one and the second slope of the other. The polynomial is nowhere less than its smallest coefficient.
-    basis: the values `(b, ...)` by which the coefficients are weighted at a point `(c, ...)`.
-    minimiser: where `(c, ...)` on the element the polynomial with coefficients `(b, ...)` is smallest. Differentiable
-        wherever that point moves smoothly.
+    slopes: from the nodes `(k, 2, ...)` of a map, its derivatives in the form that `coefficients` takes.
+    coefficients: from the slopes of two maps, the coefficients `(b, ...)` of the determinant whose columns are the
+        derivative of the first map in the first reference coordinate and that of the second map in the second one. The
+        smallest coefficient is a lower bound of the polynomial.
+    basis: from a point `(c, ...)`, the values `(b, ...)` of the polynomials that the coefficients multiply.
+    minimiser: from coefficients `(b, ...)`, the point `(c, ...)` of the element at which the polynomial is smallest.
+        Differentiable where the point moves smoothly with the coefficients.
     """
 
     slopes: Callable[[Any], Any]
@@ -50,20 +51,21 @@ class Determinant:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Element:
-    """A kind of element with `k` nodes and `c` corners. Its corners come first, counter-clockwise.
+    """A kind of element with `k` nodes and `c` corners. The corners are the first nodes, counter-clockwise.
 
-    name: what to call one in messages.
-    places: `(k, c)` where its nodes are.
-    edges: of each edge the nodes: its first and its second end, counter-clockwise, and then those between.
-    shape: values `(q, k)` of the shape functions at points `(q, c)`.
-    slopes: their derivatives `(q, k, 2)` along two reference coordinates.
-    area: of the reference element in these coordinates.
-    rules: for each degree of polynomials that quadrature can take exactly, points `(q, c)` and weights `(q,)` of sum 1.
-    degree: the one that is used unless another is asked for.
-    determinant: of the map from the reference element; None if that is the same everywhere on the element.
-    children: `(p, c, c)` the corners of each of the parts into which the element is cut.
-    enriched: the element of the same shape with more nodes by which its error is estimated; None: its children.
-    shortfall: the error of an answer over the change that the finer elements make, measured by
+    name: the word for one element in messages.
+    places: `(k, c)` points at which the nodes lie.
+    edges: the nodes of each edge: its first end, its second end, counter-clockwise, then the nodes between them.
+    shape: from points `(q, c)`, the values `(q, k)` of the shape functions.
+    slopes: from points `(q, c)`, the derivatives `(q, k, 2)` of the shape functions in two reference coordinates.
+    area: area of the reference element in these coordinates.
+    rules: quadrature rules by the degree of polynomials they integrate exactly: points `(q, c)` and weights `(q,)` of
+        sum 1.
+    degree: degree of the default rule.
+    determinant: of the map from the reference element; None if it is constant on the element.
+    children: `(p, c, c)` corners of each of the parts into which refinement cuts the element.
+    enriched: the element of the same shape with more nodes that the error estimate uses; None: it uses the children.
+    shortfall: ratio of the true error to the change that the finer elements make, measured by
         `benchmarks/accuracy.py`.
     """
 
@@ -82,21 +84,21 @@ class Element:
 
     @property
     def nodes(self) -> int:
-        """How many nodes it has."""
+        """Number of nodes."""
         return len(self.places)
 
     @property
     def corners(self) -> int:
-        """How many corners it has."""
+        """Number of corners."""
         return len(self.edges)
 
     @cached_property
     def sides(self) -> np.ndarray:
-        """The corners `(c, 2)` that each edge lies between."""
+        """The two end corners `(c, 2)` of each edge."""
         return np.array([edge[:2] for edge in self.edges])
 
     def rule(self, degree: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points `(q, c)` and weights `(q,)`, of sum 1, that integrate polynomials up to a degree exactly.
+        """Points `(q, c)` and weights `(q,)`, of sum 1, that integrate polynomials up to `degree` exactly.
 
         Raises:
             ValueError: if there is no such rule.
@@ -106,10 +108,10 @@ class Element:
         return self.rules[degree]
 
     def degree_of(self, points: int) -> int:
-        """The degree of the rule with so many points.
+        """The degree of the rule with this number of points.
 
         Raises:
-            ValueError: if there is none.
+            ValueError: if there is no such rule.
         """
         degrees = {len(weights): degree for degree, (_, weights) in self.rules.items()}
         if points not in degrees:
@@ -119,17 +121,24 @@ class Element:
         return degrees[points]
 
 
-# Two steps to the smallest ratio of two polynomials leave round-off if the second varies by less than the root of eps.
-# Where it varies more, further ones follow; they converge superlinearly, and these do if it falls to a thousandth.
+# Number of further steps of `least_ratio`. Its first two steps reach round-off if the denominator varies by less than
+# the square root of eps. If it varies more, this many steps follow. They converge superlinearly, and they suffice where
+# the denominator falls to a thousandth of its mean.
 FURTHER = 8
 
 
 @partial(custom_derivative, static=1)
 def least_ratio(determinant: Determinant, p: jax.Array, q: jax.Array) -> jax.Array:
-    """The smallest `p / q` `(...)` on an element, of polynomials with coefficients `(b, ...)`, `q` positive on it.
+    """The smallest ratio `p / q` `(...)` of two polynomials on an element.
 
-    By Dinkelbach's method (1967, Management Science 13, 492-498): with `r` the ratio where `p - r q` is smallest, from
-    `r = 0` on. From the first step on the ratio is negative just when `p` is so somewhere.
+    Dinkelbach's method (1967, Management Science 13, 492-498) starts from `r = 0`. Each step replaces `r` by the ratio
+    at the point where `p - r q` is smallest. After the first step, `r` is negative if and only if `p` is negative
+    somewhere.
+
+    Args:
+        determinant: of the element.
+        p: `(b, ...)` coefficients.
+        q: `(b, ...)` coefficients of a polynomial that is positive on the element.
     """
 
     def step(_: int, ratio: jax.Array) -> jax.Array:
@@ -145,7 +154,7 @@ def least_ratio(determinant: Determinant, p: jax.Array, q: jax.Array) -> jax.Arr
 def _(
     determinant: Determinant, primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """At the point where the ratio is smallest: the point moves too, but to first order that changes nothing."""
+    """Differentiate at the point of the smallest ratio, held fixed: to first order its motion changes nothing."""
     (p, q), (dp, dq) = primals, tangents
     ratio = least_ratio(determinant, p, q)
     place = determinant.minimiser(p - ratio[None] * q)
@@ -157,14 +166,14 @@ def _(
 
 
 def edge_functions(nodes: int, xi: np.ndarray) -> np.ndarray:
-    """Shape functions `(..., nodes)` along an edge of two or three nodes, at `xi` from its first end, 0, to 1."""
+    """Shape functions `(..., nodes)` of an edge of two or three nodes, at `xi` from 0 at its first end to 1."""
     if nodes == 2:
         return np.stack([1 - xi, xi], axis=-1)
     return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=-1)
 
 
 def edge_products(nodes: int) -> np.ndarray:
-    """Integrals `(nodes, nodes)` along an edge of each shape function times the slope of each."""
+    """Integrals `(nodes, nodes)` along an edge, `int N_a (dN_b/dxi) dxi`, of its shape functions `N`."""
     if nodes == 2:
         return np.array([[-1, 1], [-1, 1]]) / 2
     return np.array([[-3, -1, 4], [1, 3, -4], [-4, 4, 0]]) / 6

@@ -1,4 +1,4 @@
-"""Checks of a mesh: what joins what, areas, curved edges, overlaps. All on the host."""
+"""Checks of a mesh: connectivity, areas, curved edges, overlaps. All run on the host."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxbeam.mesh.element import Determinant
 from jaxbeam.mesh.elements import element_of
 
-# An element of no more area than this share of the square of the body's extent has none.
+# An area of at most this fraction of the squared extent of the body counts as zero.
 SLIVER = 1e-14
 
 
@@ -40,7 +40,8 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
         k = np.flatnonzero(~np.isfinite(nodes).all(axis=1))[0]
         raise ValueError(f"nodes: node {k} is not finite: {nodes[k].tolist()}")
     extent = np.ptp(nodes, axis=0).max()
-    # Merging nodes closer than this is what mesh generators do; a real gap is far wider.
+    # Nodes that round to the same point of a grid of 1e-9 times the extent coincide. Mesh generators merge such nodes.
+    # A real gap is far wider.
     grid = np.round(nodes / (1e-9 * extent if extent > 0 else 1.0))
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     original = first[inverse.ravel()]
@@ -65,14 +66,14 @@ def _check_geometry(nodes: np.ndarray, elements: np.ndarray) -> None:
 
 
 def _areas(nodes: Any, elements: np.ndarray) -> Any:
-    """Signed area `(t,)` of each element between its corners."""
+    """Signed area `(t,)` of the polygon of each element's corners."""
     first, *others = (nodes[elements[:, k]] for k in range(element_of(elements).corners))
     spans = [corner - first for corner in others]
     return 0.5 * sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] for a, b in itertools.pairwise(spans))
 
 
 def _check_curves(determinant: Determinant, nodes: np.ndarray, elements: np.ndarray, area: np.ndarray) -> None:
-    """Refuse elements that fold over somewhere, between corners that enclose a positive `area` `(t,)`."""
+    """Refuse elements that fold over somewhere. Their corners enclose `area` `(t,)`, which is positive."""
     kind = element_of(elements).name
     slopes = determinant.slopes(np.moveaxis(nodes[elements], 0, -1))
     stretch = determinant.coefficients(slopes, slopes) * element_of(elements).area / area
@@ -94,17 +95,17 @@ def _check_curves(determinant: Determinant, nodes: np.ndarray, elements: np.ndar
 
 
 def _surface_of(elements: np.ndarray) -> np.ndarray:
-    """Edges `(b, 2)` of the surface, the body on their left, after a check of all edges.
+    """Edges `(b, 2)` of the surface, with the body on their left. All edges of the mesh are checked on the way.
 
     Raises:
-        ValueError: if two elements lie on the same side of an edge: if each is counter-clockwise, an edge runs one way
-            in one of its elements and the other way in the other.
+        ValueError: if two elements lie on the same side of an edge. Elements are counter-clockwise, so the two elements
+            of an edge must run along it in opposite directions.
     """
     kind = element_of(elements).name
     corners = elements[:, : element_of(elements).corners]
     a, b = elements[:, element_of(elements).sides].reshape(-1, 2).T.astype(np.int64)
     total = int(elements.max()) + 1
-    # One number tells both ends of a side and its direction; those of one edge are neighbours when sorted.
+    # One number encodes both ends of a side and its direction. After sorting, the sides of one edge are neighbours.
     sides = np.sort((np.minimum(a, b) * total + np.maximum(a, b)) * 2 + (a > b))
     edge = sides >> 1
     twice = np.flatnonzero(sides[1:] == sides[:-1])
@@ -128,13 +129,14 @@ def _surface_of(elements: np.ndarray) -> np.ndarray:
 
 
 def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) -> None:
-    """Refuse elements that overlap, from the surface `edges` alone, of elements that are counter-clockwise.
+    """Refuse counter-clockwise elements that overlap. Only the `edges` of their surface are looked at.
 
-    So many elements lie over a point as the surface winds round it. That number changes only across the surface: it is
-    at most 1 if no two edges of the surface cross, and it is 1 beside each of them.
+    The winding number of the surface about a point is the number of elements that cover the point. It changes only
+    across the surface. So no point is covered twice if no two edges of the surface cross and the winding number is 1
+    beside each edge. Meshes with curved edges are not checked.
     """
     kind = element_of(elements).name
-    # Measured from one of its nodes, wherever the body lies.
+    # Positions relative to one node of the surface, so that the origin may be far from the body.
     begin, end = (nodes[edges[:, k]] - nodes[edges[0, 0]] for k in (0, 1))
     extent = np.ptp(begin, axis=0)
     for edge in element_of(elements).edges:
@@ -155,14 +157,14 @@ def _check_overlaps(nodes: np.ndarray, elements: np.ndarray, edges: np.ndarray) 
 
 
 def _crossing(begin: np.ndarray, end: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of edges, as numbers of the first and of the second, that cross each other between their ends."""
+    """Indices `(i, j)` of all pairs of edges that cross between their ends. `axis` is the coordinate to sort by."""
     low, high = np.minimum(begin, end), np.maximum(begin, end)
     order = np.argsort(low[:, axis])
     last = np.searchsorted(low[order, axis], high[order, axis])
     i, j = (order[k] for k in _ranges(np.arange(1, len(order) + 1), last))
     near = (low[i, 1 - axis] < high[j, 1 - axis]) & (low[j, 1 - axis] < high[i, 1 - axis])
     i, j = i[near], j[near]
-    # What is no more than round-off counts as touching.
+    # Edges that cross by no more than round-off only touch.
     noise = 1e-12 * np.abs(end).max()
 
     def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -176,7 +178,7 @@ def _crossing(begin: np.ndarray, end: np.ndarray, axis: int) -> tuple[np.ndarray
 
 
 def _windings(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """How often the edges wind round the point just left of the middle of each."""
+    """Winding numbers `(b,)` of the edges about points, one just to the left of the middle of each edge."""
     along = end - begin
     point = (begin + end) / 2 + 1e-6 * np.stack([-along[:, 1], along[:, 0]], axis=1)
     order = np.argsort(point[:, 1])
@@ -185,13 +187,14 @@ def _windings(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
     edge, k = _ranges(first, last)
     beside = order[k]
     side = np.sign(_cross(along[edge], point[beside] - begin[edge]))
-    # A ray to the right of the point meets the edges on that side: upward ones, or downward ones.
+    # A ray from the point in the direction of x crosses an upward edge if the point is on the left of that edge, and a
+    # downward edge if the point is on its right.
     up = np.sign(along[edge, 1])
     return np.bincount(beside, up * (side == up), minlength=len(begin))
 
 
 def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs `(i, k)` with `first[i] <= k < last[i]`."""
+    """All pairs of whole numbers `(i, k)` with `first[i] <= k < last[i]`, as two arrays."""
     lengths = np.maximum(last - first, 0)
     i = np.repeat(np.arange(len(first)), lengths)
     return i, np.arange(len(i)) + np.repeat(first - np.cumsum(lengths) + lengths, lengths)

@@ -1,4 +1,4 @@
-"""The line of a rod: nodes with a position and the angle of their section, joined in pairs."""
+"""The line of a rod: nodes with a position and the angle of their section, joined by elements of two nodes."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from jaxbeam.core import checks
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree, to_device
 from jaxbeam.mesh.mesh import Mesh, float_nodes
 
-# Least cosine of the angle between an element and the normal of its section at rest.
+# Least cosine of the angle at rest between an element and its direction by the mean angle of its two nodes.
 ALIGNED = 0.9
 
 
 @pytree
 class Line(Mesh):
-    """Nodes and elements of a rod at rest, straight or curved; stress-free as it is.
+    """Nodes and elements of a rod at rest. It may be straight or curved, and is free of stress in this shape.
 
     Args:
         nodes: `(n, 3)`: x, y, and `radian` times the angle of the axis, anticlockwise from x. Their dtype is the dtype
-            of everything computed. May be traced.
+            of every computation on the line. May be traced.
         elements: `(m, 2)` node numbers of each element, in the direction of the axis. Always concrete.
-        radian: `()` the length that stands for one radian in the third column, positive: a height, say.
+        radian: `()` the length that stands for one radian in the third column, positive, such as the height.
 
     Raises:
         ValueError: if a shape or dtype is wrong, an index is out of range, a node is unused, a coordinate is not
             finite, `radian` is not positive, or an element has no length or does not run along its angle. Traced
-            numbers of which that holds become NaN, and whatever is solved on them is `INVALID`.
+            numbers with such a fault become NaN, and every solution computed from them is `INVALID`.
     """
 
     nodes: jax.Array
@@ -66,7 +66,10 @@ def _checked_pairs(elements: Any, total: int) -> np.ndarray:
 
 
 def _run(nodes: Any, elements: np.ndarray, radian: Any) -> tuple[Any, Any, Any]:
-    """Length of each element `(m,)`, how far it runs along its angle, and that angle."""
+    """Of each element `(m,)`: its length, its extent in the direction of its angle, and that angle.
+
+    The angle is the mean of those of its two nodes.
+    """
     xp = namespace(nodes, radian)
     first, second = (xp.asarray(nodes)[elements[:, k]] for k in (0, 1))
     chord, angle = (second - first)[:, :2], (first + second)[:, 2] / (2 * radian)
@@ -94,10 +97,10 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
     """A straight line of evenly spaced nodes along x, centred on the origin.
 
     Args:
-        length: of the rod, positive; may be traced.
+        length: length of the rod, positive; may be traced.
         radian: see `Line`; may be traced.
-        nodes: how many, at least 2.
-        dtype: of the nodes; by default JAX's float.
+        nodes: number of nodes, at least 2.
+        dtype: dtype of the nodes; by default JAX's float.
 
     Raises:
         ValueError: if `nodes` is not a whole number of at least 2, or a length is not positive and finite.
@@ -113,11 +116,11 @@ def straight(length: Numbers, radian: Numbers, nodes: int, dtype: Any = None) ->
 
 
 def beside(x: Any, offset: Any, radian: Any) -> Any:
-    """Points `(..., k, 2)` beside the nodes `x` `(..., k, 3)` of a line: `(x - e sin theta, y + e cos theta)`.
+    """Points `(..., k, 2)` on the sections of the nodes of a line: `(x - e sin theta, y + e cos theta)`.
 
     Args:
-        x: positions of the nodes.
-        offset: `e` `(..., k)`, along the section to the left of the axis.
+        x: `(..., k, 3)` coordinates of the nodes, as in `Line`.
+        offset: `(..., k)` distance `e` from the node, along the section to the left of the axis.
         radian: `(...)` as in `Line`.
     """
     xp = namespace(x, offset, radian)

@@ -1,7 +1,7 @@
 """Triangle meshes: rest positions of the nodes and the triangles that join them.
 
-Triangles have three nodes (P1) or six (P2, in the order of `jaxbeam.mesh.elements`) and are counter-clockwise. Lengths
-are in the user's unit. Everything is checked here, on the host, once; what follows trusts a `Mesh`.
+Triangles have three nodes (P1) or six (P2, in the order of `jaxbeam.mesh.triangle`) and are counter-clockwise. Lengths
+are in the user's unit. A mesh is checked once, here, on the host. The rest of the package trusts a `Mesh`.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ class Mesh:
 
     Args:
         nodes: `(n, 2)` rest positions, in the user's length unit. Their dtype is the dtype of every
-            computation on the mesh. May be traced: shape is differentiable.
+            computation on the mesh. May be traced: results are differentiable in the shape.
         elements: `(t, 3)` or `(t, 6)` node numbers of each triangle: its corners, counter-clockwise, and then the
             nodes between corners 0 and 1, 1 and 2, 2 and 0. Always concrete.
 
     Raises:
         ValueError: if a shape or dtype is wrong, an index is out of range, a triangle repeats a node, is
             listed twice, is inverted somewhere or has no area, a node is unused, two nodes coincide, a
-            coordinate is not finite, or two triangles overlap. Where edges are curved, overlaps are found only
-            between triangles that share an edge. While `nodes` is traced, a node that is not finite and a triangle that
-            is inverted or has no area make it NaN, and whatever is solved on it `INVALID`; nodes that coincide and
-            triangles that overlap without sharing an edge are not looked for.
+            coordinate is not finite, or two triangles overlap. In a mesh with curved edges, overlaps are found only
+            between triangles that share an edge. If `nodes` is traced, a node that is not finite or a triangle that is
+            inverted or has no area turns all nodes to NaN, and every solution computed from them is `INVALID`. Traced
+            nodes that coincide, and traced triangles that overlap without sharing an edge, are not detected.
     """
 
     nodes: jax.Array
     elements: np.ndarray = index_field()
-    # A length, on the line of a rod: its nodes have a third coordinate, this times an angle.
+    # None on triangles. On a `Line` it is a length: the third coordinate of a node is this length times an angle.
     radian: ClassVar[Any] = None
 
     def __post_init__(self) -> None:
@@ -63,7 +63,7 @@ class Mesh:
         return f"{type(self).__name__}({self.summary()})"
 
     def summary(self) -> str:
-        """Its sizes in words."""
+        """The numbers of nodes and elements, and the dtype, in words."""
         if not all(hasattr(each, "shape") for each in (self.nodes, self.elements)):
             return "a tree of other values"
         count, nodes = self.elements.shape
@@ -72,7 +72,7 @@ class Mesh:
 
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:
-    """Corner nodes, in the order given, and the nodes that lie between two of them."""
+    """The `corners`, in the order given, and then the nodes on the edges between two of them."""
     among, found = np.isin(mesh.elements, corners), [np.zeros(0, int)]
     for first, second, *between in element_of(mesh.elements).edges:
         found.append(mesh.elements[among[:, first] & among[:, second]][:, between].ravel())
@@ -84,7 +84,7 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
 
     Args:
         mesh: with concrete nodes.
-        predicate: takes the `(n,)` coordinates and returns `(n,)` booleans.
+        predicate: takes the coordinates `x` and `y`, each `(n,)`, and returns `(n,)` booleans.
 
     Raises:
         ValueError: if the predicate returns another shape or selects nothing, or the nodes are traced.
@@ -107,7 +107,7 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
 
 
 def nearest_node(mesh: Mesh, point: Numbers) -> int:
-    """Number of the node nearest to `point` `(2,)` at rest (the lowest number among equals).
+    """Number of the node nearest to `point` `(2,)` at rest; of nodes equally near, the lowest number.
 
     Raises:
         ValueError: if the point is not two finite numbers, or the nodes are traced.
@@ -119,7 +119,7 @@ def nearest_node(mesh: Mesh, point: Numbers) -> int:
 
 
 def pieces(elements: np.ndarray, count: int) -> np.ndarray:
-    """`(n,)` number, from 0, of the connected piece that each of `count` nodes belongs to."""
+    """For each of `count` nodes, the number `(count,)`, from 0, of the connected piece that it belongs to."""
     label = np.arange(count)
     while True:
         lowest = label[elements].min(axis=1)
@@ -141,14 +141,20 @@ def _concrete_nodes(mesh: Mesh) -> np.ndarray:
 
 
 def check_triangles(mesh: Mesh) -> None:
-    """Refuse what is not a mesh of triangles."""
+    """Raise `ValueError` if `mesh` is not a mesh of triangles."""
     checks.instance("mesh", mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)")
     if mesh.radian is not None:
         raise ValueError("mesh: expected triangles, got the Line of a rod, whose body is rod(line, height, params)")
 
 
 def float_nodes(value: Any, columns: int, row: str) -> Any:
-    """Rest positions `(n, columns)` as floats, each `row` of them; JAX arrays as they are."""
+    """Check rest positions `(n, columns)` and return them as floats; JAX arrays are returned as they are.
+
+    Args:
+        value: the positions.
+        columns: number of coordinates of a node.
+        row: names of the coordinates, for the message.
+    """
     array = checks.real("nodes", value)
     if array.dtype.kind != "f":
         if isinstance(value, jax.Array):

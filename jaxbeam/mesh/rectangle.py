@@ -27,10 +27,10 @@ def rectangle(
     order: int = 1,
     graded: bool = False,
 ) -> Mesh:
-    """Mesh of a rectangle centred on the origin, whose triangles have `nx` x `ny` corners.
+    """Mesh of a rectangle centred on the origin: a grid of `nx` x `ny` corners, whose cells are split into triangles.
 
-    Corner `(i, j)`, column `i` from the left and row `j` from below, has number `i * ny + j`; the cell
-    centres of crossed diagonals follow after all of these, and then the nodes between corners, if `order` is 2.
+    The corner in column `i` from the left and row `j` from below is node `i * ny + j`. The cell centres of crossed
+    diagonals follow after the corners, and then, if `order` is 2, the nodes between corners.
 
     Args:
         length: extent in x, positive; may be traced.
@@ -40,11 +40,12 @@ def rectangle(
         diagonals: how a cell is split. `"one-sided"`: two triangles, by the diagonal from lower left to
             upper right. `"mirrored"`: the same below mid-height and its mirror image above, so the mesh is
             symmetric about mid-height (`ny` must be odd). `"crossed"`: four triangles about the centre.
-        dtype: of the nodes; by default JAX's float.
-        order: of the shape functions: 1 for triangles of three nodes, 2 for six (see `quadratic`).
-        graded: crowd columns right of the left edge, by the power 3/2 of the distance, and of the middle, by a
-            hyperbolic sine of it, with two thirds of the columns between these two (see `middle_column`); and rows at
-            both faces. For a beam that is clamped at that edge and steered from its middle.
+        dtype: dtype of the nodes; by default JAX's float.
+        order: order of the shape functions: 1 for triangles of three nodes, 2 for six (see `quadratic`).
+        graded: space columns and rows unevenly, for a beam that is clamped at its left edge and steered from its
+            middle. In the left half, the distance of a column from the left edge goes with the power 3/2 of its
+            number. In the right half, the distance from the middle goes with a hyperbolic sine. Two thirds of the
+            columns are in the left half (see `middle_column`). Rows are denser at both faces.
 
     Returns:
         A `Mesh`, differentiable in `length` and `height`.
@@ -78,14 +79,14 @@ def rectangle(
 
 def _unit_square(nx: int, ny: int, diagonals: Diagonals, graded: bool) -> tuple[np.ndarray, np.ndarray]:
     """Corners `(n, 2)` and triangles `(t, 3)` of the mesh of a square of side 1."""
-    across, along = np.linspace(0, 1, nx), np.linspace(-0.5, 0.5, ny)
+    columns, rows = np.linspace(0, 1, nx), np.linspace(-0.5, 0.5, ny)
     if graded:
         middle = middle_column(nx, graded)
         left, right = np.arange(middle + 1) / middle, np.arange(1, nx - middle) / (nx - 1 - middle)
-        # Of 2.5, 3 and 3.5 the last left the reference beam the least error on most meshes.
-        across = 0.5 * np.append(left**1.5, 1 + np.sinh(3.5 * right) / np.sinh(3.5))
-        along = 0.6 * along + 0.2 * np.sin(np.pi * along)
-    unit_x, unit_y = np.meshgrid(across - 0.5, along, indexing="ij")
+        # Of the factors 2.5, 3 and 3.5, the last gave the least error of the reference beam on most meshes.
+        columns = 0.5 * np.append(left**1.5, 1 + np.sinh(3.5 * right) / np.sinh(3.5))
+        rows = 0.6 * rows + 0.2 * np.sin(np.pi * rows)
+    unit_x, unit_y = np.meshgrid(columns - 0.5, rows, indexing="ij")
     unit = np.stack([unit_x.ravel(), unit_y.ravel()], axis=1)
     i, j = (a.ravel() for a in np.meshgrid(np.arange(nx - 1), np.arange(ny - 1), indexing="ij"))
     lower_left = i * ny + j
@@ -106,10 +107,10 @@ def _unit_square(nx: int, ny: int, diagonals: Diagonals, graded: bool) -> tuple[
 
 
 def middle_column(nx: int, graded: bool) -> int:
-    """The column of corners of a `rectangle` that lies in the middle of its length.
+    """Number of the column of corners of a `rectangle` that lies in the middle of its length.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if no column lies there.
     """
     if graded and nx < 3:
         raise ValueError(f"nx: expected at least 3 for a graded mesh, got {nx}: no node lies in the middle; use 3")

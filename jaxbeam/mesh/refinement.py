@@ -1,4 +1,4 @@
-"""Finer meshes that contain every displacement of a coarser one."""
+"""Finer meshes that can represent every displacement field of a coarser one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from jaxbeam.mesh.mesh import Mesh, check_triangles
 
 @usual_rules
 def quadratic(mesh: Mesh) -> Mesh:
-    """The mesh of the same triangles with six nodes each: those between corners follow after the corners.
+    """The mesh of the same triangles with six nodes each. The new nodes are numbered after the old ones.
 
     Differentiable in the nodes.
 
     Raises:
-        ValueError: if the elements have so many nodes already, or it is the line of a rod.
+        ValueError: if the triangles have six nodes already, or `mesh` is the line of a rod.
     """
     check_triangles(mesh)
     element = element_of(mesh.elements)
@@ -28,44 +28,50 @@ def quadratic(mesh: Mesh) -> Mesh:
         raise ValueError(
             f"mesh: there is no {element.name} with more than its {element.nodes} nodes; use refined(mesh)"
         )
-    return _made(mesh, enriched_elements(mesh.elements, len(mesh.nodes)))
+    return _finer_mesh(mesh, enriched_elements(mesh.elements, len(mesh.nodes)))
 
 
 @usual_rules
 def refined(mesh: Mesh) -> Mesh:
-    """The mesh with every element cut into four by the middles of its edges, four in the place of one.
+    """The mesh with every element cut into four at the middles of its edges. The four follow each other in `elements`.
 
-    Nodes keep their numbers, and curved edges their shape. Differentiable in the nodes.
+    Nodes keep their numbers, and curved edges keep their shape. Differentiable in the nodes.
 
     Raises:
-        ValueError: if it is the line of a rod.
+        ValueError: if `mesh` is the line of a rod.
     """
     check_triangles(mesh)
-    return _made(mesh, cut_elements(mesh.elements, len(mesh.nodes)))
+    return _finer_mesh(mesh, cut_elements(mesh.elements, len(mesh.nodes)))
 
 
 class Finer(NamedTuple):
-    """How a finer mesh comes from a coarse one: its `elements`, and each of its nodes as a mean of coarse `nodes`
-    `(n, k)` with `weights` `(n, k)`. Displacements are carried over as positions are."""
+    """A finer mesh and its nodes as weighted means of the nodes of a coarse mesh.
+
+    Displacements are carried to the finer mesh in the same way as positions.
+
+    elements: node numbers of the elements of the finer mesh.
+    nodes: `(n, k)` for each of the `n` finer nodes, numbers of coarse nodes.
+    weights: `(n, k)` their weights in the mean.
+    """
 
     elements: np.ndarray
     nodes: np.ndarray
     weights: np.ndarray
 
     def carry(self, field: Any) -> Any:
-        """The nodal field `(n, d)` of the coarse mesh on the finer one."""
+        """A nodal field of the coarse mesh, with `d` values at a node, on the finer mesh: `(n, d)`."""
         xp = namespace(field)
         return xp.sum(self.weights[:, :, None].astype(field.dtype) * xp.asarray(field)[self.nodes], axis=1)
 
 
 def cut_elements(elements: np.ndarray, count: int) -> Finer:
-    """The elements of `count` nodes, each cut into its children."""
+    """Each element of a mesh of `count` nodes, cut into its children."""
     element = element_of(elements)
     return _divided(elements, count, element, element.children)
 
 
 def enriched_elements(elements: np.ndarray, count: int) -> Finer:
-    """The finer elements by which the error of a mesh is estimated: with more nodes, or else cut into children."""
+    """The finer elements that the error estimate uses: with more nodes if the kind has an enriched one, else cut."""
     element = element_of(elements)
     if element.enriched is None:
         return cut_elements(elements, count)
@@ -73,15 +79,19 @@ def enriched_elements(elements: np.ndarray, count: int) -> Finer:
 
 
 def _divided(elements: np.ndarray, count: int, target: Element, parts: np.ndarray) -> Finer:
-    """Elements of `count` nodes cut into `parts` `(p, c, c)`, given by their corners, each of the kind `target`.
+    """Each element of a mesh of `count` nodes, divided into parts. Nodes keep their numbers, and new ones follow.
 
-    Nodes keep their numbers, and new ones follow.
+    Args:
+        elements: node numbers of the mesh.
+        count: number of nodes of the mesh.
+        target: the kind of element that each part becomes.
+        parts: `(p, c, c)` corners of each part, as points of the divided element.
     """
     old = element_of(elements)
     places = np.einsum("kp,cpl->ckl", target.places, parts).reshape(-1, old.corners)
-    # Parts share nodes with each other, and elements with their neighbours. A node is known by the corners of its
-    # element that it lies between, with their weights: multiples of a quarter on triangles,
-    # and of a sixteenth on quadrilaterals.
+    # Parts share nodes with each other and with parts of neighbouring elements. So a new node is identified by the
+    # element corners of nonzero weight and their weights. These are multiples of a quarter on triangles and of a
+    # sixteenth on quadrilaterals.
     shares, corners = np.round(64 * places).astype(np.int64), elements[:, None, : old.corners].astype(np.int64)
     keys = np.sort(np.where(shares > 0, corners * 128 + shares, -1), axis=2)
     same = (np.abs(places[:, None] - old.places).max(axis=2) < 1e-3).T
@@ -98,5 +108,5 @@ def _divided(elements: np.ndarray, count: int, target: Element, parts: np.ndarra
     return Finer(whole.reshape(-1, target.nodes), nodes, weights)
 
 
-def _made(mesh: Mesh, finer: Finer) -> Mesh:
+def _finer_mesh(mesh: Mesh, finer: Finer) -> Mesh:
     return Mesh(finer.carry(namespace(mesh.nodes).asarray(mesh.nodes)), finer.elements)

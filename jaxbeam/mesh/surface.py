@@ -1,12 +1,12 @@
-"""Where a tendon is attached to a body: at a node, or over a patch of the surface.
+"""The anchor of a tendon on a body: a node, or a patch of the surface.
 
-A force on one node is a point load, under which the displacement of a continuum is infinite: the answer drifts without
-end as the mesh is refined. A patch of finite width has a limit. Its position is the mean of the surface, weighted by a
-tent of the arc length `s` from the anchor,
+A force on one node is a point load. The displacement of a continuum under a point load is infinite, so the answer grows
+without bound as the mesh is refined. With a patch of finite width the answer has a limit. The position of the anchor is
+the mean of the surface positions `x(s)`, weighted by a tent function of the arc length `s` from the anchor's node:
 
-    p = int w(s) x(s) ds / int w(s) ds,     w = max(0, 1 - |s| / width),
+    p = int w(s) x(s) ds / int w(s) ds,     w = max(0, 1 - |s| / width).
 
-with `x(s)` as the shape functions have it, so that it is a weighted mean of nodes whose weights add up to 1.
+`x(s)` is interpolated by the shape functions, so `p` is a weighted mean of nodes, with weights of sum 1.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from jaxbeam.mesh.element import edge_functions
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
 
-# Gauss's rule of two points on (0, 1): exact for a shape function times the tent.
+# Gauss's rule of two points on (0, 1): exact for a shape function times the tent function.
 _POINTS = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
 
 
 def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes `(k,)` of the surface within `width` of a corner node of it, the node itself first, and weights `(k,)`.
+    """Nodes `(k,)` of the patch of surface about a corner `node`, `node` first, and their weights `(k,)`.
 
-    Arc length is measured along edges taken as straight, round corners of the body too. With a width of 0 it is the
-    node alone.
+    The patch reaches the arc length `width` to either side, also round corners of the body. Edges are taken as straight
+    to measure it. A patch of width 0 is the node alone.
 
     Raises:
         ValueError: if the nodes are traced, the node is not a corner of a triangle on the surface, or the surface
@@ -53,11 +53,11 @@ def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
 def walk(
     positions: np.ndarray, edges: np.ndarray, node: int, width: float
 ) -> Iterator[tuple[list[int], float, float, float]]:
-    """The edges of a surface within `width` of a node, first one way round the body and then the other.
+    """The edges of a surface within the arc length `width` of a node: first one way round the body, then the other.
 
     Yields:
-        The edge in the direction of the walk; the arc length at its beginning; its length; and the share of it, from
-        its beginning, that lies within `width`.
+        For each edge: its nodes in the direction of the walk; the arc length at its beginning; its length; and the
+        fraction of it, from its beginning, that lies within `width`.
 
     Raises:
         ValueError: if the node is not a corner on the surface, or the surface closes on itself within `width`.
@@ -66,7 +66,8 @@ def walk(
         following = {line[0]: line for line in ways.tolist()}
         here, s, left = node, 0.0, len(ways)
         while s < (1 - 1e-9) * width:
-            # Where two parts of a body touch at a node, the way may lead round the other part for ever.
+            # `left` ends a walk that never comes back: where two parts of a body touch at a node, it may go round the
+            # other part for ever.
             if here not in following or (s > 0 and here == node) or left == 0:
                 problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
                 raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
@@ -77,14 +78,20 @@ def walk(
 
 
 def surface(mesh: Mesh) -> np.ndarray:
-    """The edges `(b, 2)` or `(b, 3)` of the surface, each as its first and second corner, counter-clockwise around the
-    body, and the node between them if there is one."""
+    """The edges `(b, 2)` or `(b, 3)` of the surface: first and second corner, and the node between if there is one.
+
+    The corners are in counter-clockwise order around the body.
+    """
     return surface_of((key_of(mesh, "elements"),))
 
 
 @lru_cache(maxsize=32)
 def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
-    """The edges of the surface, as `surface` gives them, of triangles `(t, k)`; none of no triangles."""
+    """The edges of the surface, as `surface` returns them.
+
+    Args:
+        bodies: the triangles `(t, k)` of each body; without bodies there are no edges.
+    """
     if not bodies:
         return read_only(np.zeros((0, 2)), np.int32)
     triangles = np.concatenate([body.array for body in bodies])

@@ -17,7 +17,8 @@ import numpy as np
 from jaxbeam.mesh.bernstein import EDGES, array_module, basis, minimiser
 from jaxbeam.mesh.element import Determinant, Element
 
-# Of each rule: weight, and the coordinate that differs from the two others, of every orbit of three points.
+# The orbits of each rule, by its degree: the weight of a point, and the one of its three coordinates that differs from
+# the two others. An orbit has three points, or one if that coordinate is 1/3.
 _ORBITS = {
     1: [(1.0, 1 / 3)],
     2: [(1 / 3, 2 / 3)],
@@ -62,22 +63,25 @@ def _quadratic_slopes(points: np.ndarray) -> np.ndarray:
     return by_l[:, :, 1:] - by_l[:, :, :1]
 
 
-# ------------------------------------------------------------------------- how the map of six nodes stretches area
+# ----------------------------------------------------------------------- determinant of the map of six-node triangles
 
 
 def corner_slopes(x: Any) -> list[list[Any]]:
-    """Derivatives `(2, ...)` in `l1` and `l2`, at each corner, of the map with six nodes at `x` `(6, 2, ...)`.
+    """For each corner, the derivatives `(2, ...)` in `l1` and in `l2` of the map with nodes `x` `(6, 2, ...)`.
 
-    In between they are linear in the barycentric coordinates.
+    Between corners the derivatives are linear in the barycentric coordinates.
     """
     slopes = _quadratic_slopes(_CORNERS)
-    # Python's own numbers leave the dtype of the positions as it is.
+    # Python floats do not change the dtype of the positions.
     sums = lambda factors: sum(f * x[k] for k, f in enumerate(factors.tolist()) if f)
     return [[sums(slopes[c, :, d]) for d in range(2)] for c in range(3)]
 
 
 def coefficients(left: list[list[Any]], right: list[list[Any]]) -> Any:
-    """Bernstein coefficients `(6, ...)` of the determinant of two maps, from their `corner_slopes`."""
+    """Bernstein coefficients `(6, ...)` of the determinant of two maps, from the `corner_slopes` of each.
+
+    The determinant takes the derivative in `l1` from the `left` map and the derivative in `l2` from the `right` one.
+    """
     crossed = lambda a, b: left[a][0][0] * right[b][1][1] - left[a][0][1] * right[b][1][0]
     found = [crossed(a, a) for a in range(3)] + [(crossed(a, b) + crossed(b, a)) / 2 for a, b in EDGES]
     return array_module(found[0]).stack(found)
@@ -87,11 +91,11 @@ def coefficients(left: list[list[Any]], right: list[list[Any]]) -> Any:
 
 _CORNERS = np.eye(3)
 _MIDDLES = np.array([(_CORNERS[a] + _CORNERS[b]) / 2 for a, b in EDGES])
-# The corners of the four parts into which the middles of its edges cut a triangle.
+# The corners of the four triangles that result from cutting a triangle at the middles of its edges.
 _FOUR = np.concatenate([_CORNERS, _MIDDLES])[np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])]
 
-# From three nodes to six the change falls hardly short of the error. From six-node triangles to smaller ones it falls
-# short by what the corners of the clamp leave, where the stress is infinite.
+# `shortfall`: the change from three nodes to six is about the true error. From six-node triangles to smaller ones the
+# change is smaller than the error, because of the infinite stress at the corners of the clamp.
 QUADRATIC_TRIANGLE = Element(
     name="triangle",
     places=np.concatenate([_CORNERS, _MIDDLES]),

@@ -1,1 +1,1 @@
-"""Energies: the contract, materials, and one file for each kind."""
+"""Energies: the interface, the materials, and one file for each kind of energy."""

@@ -1,11 +1,11 @@
 """Cables: tendons that only pull. A slack cable has no force and no energy.
 
-With the stretch `s = l - l*` of a cable, beyond its commanded length, the energy is
+With the length `l`, the commanded length `l*` and the stretch `s = l - l*` of a cable, the energy is
 
-    k w^2 h(s / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1),
+    k w^2 h(s / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1).
 
-so that over the transition width `w` the stiffness rises in proportion from 0 to `k`. Energy, tension and stiffness are
-continuous, as Newton's method needs it.
+Over the transition width `w` the stiffness rises linearly from 0 to `k`. Energy, tension and stiffness are continuous,
+as Newton's method needs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_st
 
 @pytree
 class CableParams(TendonParams):
-    """Those of a tendon, and `transition` `(m,)`: the stretch over which a slack cable becomes taut."""
+    """Parameters of cables: those of tendons and one more.
+
+    transition: `(m,)` stretch `w`, a length, over which a slack cable becomes taut.
+    """
 
     transition: Any = None
 
@@ -52,7 +55,7 @@ class CableEnergy(TendonEnergy):
         return self.stiffness(params.modulus, params.commanded) * params.transition * shape
 
     def _stretch(self, x: jax.Array, params: Any) -> jax.Array:
-        """How far it is stretched beyond its commanded length, over the width of the transition."""
+        """Stretch beyond the commanded length, relative to the transition width: `s / w` `()`."""
         return (self.length(x, params) - params.commanded) / params.transition
 
     def valid(self, params: Any) -> jax.Array:
@@ -80,8 +83,8 @@ def cables(
         modulus: as for `tendons`.
         stiffness: as for `tendons`.
         width: as for `tendons`.
-        transition: the stretch, over the natural length, within which a cable becomes taut, positive; scalar or
-            `(m,)`; differentiable. The smaller, the sharper the change of stiffness that Newton's method has to cross.
+        transition: stretch over which a slack cable becomes taut, relative to the natural length, positive; scalar or
+            `(m,)`; differentiable. If it is small, the stiffness changes sharply, which is hard for Newton's method.
 
     Raises:
         ValueError: as `tendons` does, or if a transition is not positive and finite.
@@ -94,7 +97,7 @@ def cables(
 
 
 def _as_cables(term: Term, stiffness: Callable[[jax.Array, jax.Array], jax.Array], transition: Any) -> Term:
-    """Cables in place of two-way tendons. `transition` `(m,)` is a length."""
+    """A term of cables with the nodes and parameters of two-way tendons. `transition` `(m,)` is a length."""
     shared = {field.name: getattr(term.params, field.name) for field in dataclasses.fields(TendonParams)}
     energy = CableEnergy(stiffness, term.kind.points)  # type: ignore[attr-defined]
     return Term(energy, np.asarray(term.nodes), CableParams(**shared, transition=transition))

@@ -1,13 +1,13 @@
-"""Energies, what they can say of themselves, and the terms of a scene that are made of them.
+"""The interface of energies, and the terms of a scene.
 
-A `Term` is all the solver knows of physics: one energy, the nodes of its stencils, and their parameters. Forces,
-Hessians, assembly and the derivative through equilibrium follow from these. The force of a term on the body is minus
-the gradient of its energy.
+A scene is a sum of terms. A `Term` is one energy function, the nodes of the stencils (elements, tendons, loaded nodes)
+that it applies to, and their parameters. The solver knows nothing else of physics. Forces, Hessians, assembly and the
+derivative through equilibrium follow from these. The force of a term on the body is minus the gradient of its energy.
 
-The energy may be a bare function `(x, params) -> scalar`. What else there is to say of it, it says itself, as a
-subclass of `Energy`: how it is commanded, ramped, checked, bounded, refined, drawn and measured. Every method has a
-safe default, which is what a bare function gets. The scene, the solver, error estimates and pictures ask these methods
-and know no kind of energy by name, so a new kind of physics is one file.
+The energy may be a bare function `(x, params) -> scalar`. To do more, write it as a subclass of `Energy`. Its methods
+define how the energy is commanded, ramped, checked, bounded, refined, drawn and measured. Every method has a safe
+default, which also serves a bare function. The scene, the solver, error estimates and pictures call these methods and
+know no kind of energy by name, so a new kind of physics is one file.
 """
 
 from __future__ import annotations
@@ -27,26 +27,27 @@ from jaxbeam.physics.projection import project_each
 
 
 class NotRefinable(ValueError):
-    """Raised by `Energy.refined`: the term cannot be carried to a finer mesh. The text says why."""
+    """Raised by `Energy.refined` if the term cannot be carried to a finer mesh. The text says why."""
 
 
 class Energy:
-    """The energy of one stencil, and what it can say of itself.
+    """The energy of one stencil: a function, with attributes and methods that describe it to the rest of the package.
 
-    Make a subclass a frozen dataclass of functions and numbers: it is hashed, and a new value compiles anew. Parameters
-    that change belong in `params`. Arguments named `x` are `(m, k, d)` positions of the nodes of `m` stencils, and
-    `params` their parameters with leading axis `m`; only `__call__` gets those of a single stencil.
+    Make a subclass a frozen dataclass of functions and numbers. It is hashed, and each new value compiles again, so
+    parameters that change belong in `params`. In `__call__`, `x` and `params` are the positions and parameters of a
+    single stencil. In the other methods below, `x` `(m, k, d)` holds the positions of the nodes of `m` stencils, and
+    `params` their parameters with leading axis `m`.
     """
 
-    name: ClassVar[str] = "term"  # what to call a stencil in pictures and messages
-    body: ClassVar[bool] = False  # elastic material: its energy is strain energy, and no rigid motion changes it
-    fills: ClassVar[bool] = False  # its stencils are elements of area, whose outer edges are the surface of the body
-    coordinates: ClassVar[int | None] = None  # coordinates of a node that it is made for: 2, 3 on a rod; None: any
-    rest_command: ClassVar[float | None] = None  # command at which it does nothing; None: it is not commanded
-    shared_command: ClassVar[bool] = False  # one command for all stencils of a term, and not one for each
-    commands: ClassVar[checks.Range] = checks.FINITE  # the range of its commands
-    command_unit: ClassVar[float | None] = None  # a change of command of order 1; None: the width of its bounds
-    command_hint: ClassVar[str] = ""  # what a command means, for the message about one out of range
+    name: ClassVar[str] = "term"  # word for a stencil in pictures and messages
+    body: ClassVar[bool] = False  # elastic material: the energy is a strain energy, unchanged by rigid motions
+    fills: ClassVar[bool] = False  # the stencils are elements of area, whose outer edges are the surface of the body
+    coordinates: ClassVar[int | None] = None  # number `d` that a node must have: 2, or 3 on a rod; None: any
+    rest_command: ClassVar[float | None] = None  # command at which the term does nothing; None: it has no command
+    shared_command: ClassVar[bool] = False  # all stencils of a term share one command, instead of one for each
+    commands: ClassVar[checks.Range] = checks.FINITE  # range of the commands
+    command_unit: ClassVar[float | None] = None  # unit for changes of the command; None: the width of its bounds
+    command_hint: ClassVar[str] = ""  # meaning of a command, for the message about a command out of range
 
     def __call__(self, x: jax.Array, params: Any) -> jax.Array:
         """Energy `()` of one stencil at positions `x` `(k, d)`."""
@@ -55,11 +56,11 @@ class Energy:
     # ------------------------------------------------------------------------------------ derivatives
 
     def gradients(self, x: jax.Array, params: Any) -> tuple[jax.Array, jax.Array]:
-        """Energies `(m,)` and their gradients `(m, k, d)`. By autodiff unless there is a faster way."""
+        """Energies `(m,)` and their gradients `(m, k, d)`, by autodiff. Override it where there is a faster way."""
         return jax.vmap(jax.value_and_grad(self))(x, params)
 
     def hessians(self, x: jax.Array, params: Any, convex: bool = False) -> jax.Array:
-        """Hessians `(k d, k d, m)`, by autodiff; with `convex`, the nearest positive semidefinite ones."""
+        """Hessians `(k d, k d, m)`, by autodiff; if `convex`, projected to the nearest positive semidefinite ones."""
         m, k, d = x.shape
         of_one = lambda flat, params: self(flat.reshape(k, d), params)
         hessians = jax.vmap(jax.hessian(of_one))(x.reshape(m, k * d), params)
@@ -68,15 +69,15 @@ class Energy:
     # -------------------------------------------------------------------------------------- actuation
 
     def command(self, params: Any, values: jax.Array) -> Any:
-        """The parameters under commands `(m,)`, one for each stencil, or `(1,)` if they share it."""
+        """The parameters with the commands set to `values`: `(m,)`, or `(1,)` if the stencils share one command."""
         return params
 
     def command_of(self, params: Any) -> jax.Array:
-        """The commands `(m,)` or `(1,)` that the parameters are under: the inverse of `command`."""
+        """The commands `(m,)` or `(1,)` that the parameters hold: the inverse of `command`."""
         raise NotImplementedError
 
     def partway(self, params: Any, share: jax.Array) -> Any:
-        """The parameters with a share of the actuation or the load: none at 0, all at 1."""
+        """The parameters with the fraction `share` `()` of the actuation or the load: none at 0, all at 1."""
         if self.rest_command is None:
             return params
         return self.command(params, (1 - share) * self.rest_command + share * self.command_of(params))
@@ -84,65 +85,70 @@ class Energy:
     # ----------------------------------------------------------------------------- ranges and bounds
 
     def valid(self, params: Any) -> Any:
-        """Whether traced parameters are in their range `()`. That they are finite is checked for every term."""
+        """Whether traced parameters are in their range, `()`. That they are finite is checked for every term."""
         return True
 
     def objection(self, term: Term, fixed: np.ndarray) -> str:
-        """Why the term cannot act where the coordinates `fixed` `(n, d)` do not move, or nothing."""
+        """Why the term cannot act in a scene whose coordinates `fixed` `(n, d)` do not move; empty if it can."""
         return ""
 
     def margin(self, x: jax.Array, params: Any) -> jax.Array | None:
-        """What must stay positive `(m,)`, such as the smallest `J` of an element; None if there is nothing."""
+        """A quantity `(m,)` that must stay positive, such as the smallest `J` of an element; None: there is none."""
         return None
 
     def longest_step(self, x: jax.Array, dx: jax.Array, params: Any, keep: float) -> jax.Array | None:
-        """The largest `t` `(m,)` for which the share `keep` of the margin is left at `x + t dx`; None: any."""
+        """The largest `t` `(m,)` for which `x + t dx` keeps the fraction `keep` of the margin; None: no limit."""
         return None
 
     # ------------------------------------------------------------------------------------- refinement
 
     def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
-        """The term on a finer mesh, whose elements are `parts` for each one now. Nodes keep their numbers.
+        """The term on a finer mesh, on which nodes keep their numbers.
+
+        Args:
+            term: the term to carry over.
+            mesh: the finer mesh.
+            parts: number of its elements for each element of the present mesh.
 
         Raises:
-            NotRefinable: if it does not say how. Then there is no error bar for a scene with it.
+            NotRefinable: if the energy does not define it. A scene with such a term has no error bar.
         """
         raise NotRefinable("it does not say what it becomes on a finer mesh (see Energy.refined)")
 
     def without_limit(self, term: Term, free: np.ndarray) -> str:
-        """Why the answer has no limit as the mesh is refined, or nothing. `free` `(n,)`: nodes that move."""
+        """Why the answer has no limit as the mesh is refined; empty if it has. `free` `(n,)`: whether a node moves."""
         return ""
 
     # -------------------------------------------------------------------------- measures and pictures
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
-        """What can be measured on each stencil, `(m,)` by name, such as `length` and `tension` of tendons."""
+        """Measured quantities `(m,)` of the stencils, by name, such as `length` and `tension` of tendons."""
         return {}
 
     def at_points(self, x: jax.Array, params: Any, measure: Callable[..., jax.Array]) -> jax.Array | None:
-        """`measure(H, density, material)` at the quadrature points of elements, `(m, q, ...)`; None without any."""
+        """`measure(H, density, material)` at the quadrature points, `(m, q, ...)`; None: there are no such points."""
         return None
 
     def sides(self, x: jax.Array, params: Any) -> list[jax.Array]:
-        """Segments `(m, 2, 2)` that bound a body without elements of area, such as both sides of a rod."""
+        """Segments that bound a body without elements of area: `(m, 2, 2)` for each of its sides, as of a rod."""
         return []
 
     def line(self, x: jax.Array, params: Any) -> jax.Array | None:
-        """Points `(m, p, 2)` of the line that each stencil is drawn as, in a colour of its own; None: not drawn."""
+        """Points `(m, p, 2)` of a line to draw for each stencil, in a colour of its own; None: it is not drawn."""
         return None
 
     def arms(self, x: jax.Array, params: Any) -> jax.Array | None:
-        """Segments `(m, p, 2, 2)` from the body to the points of the line, where these are not nodes; None: none."""
+        """Segments `(m, p, 2, 2)` to draw from the body to points of `line` that are not nodes; None: none."""
         return None
 
     def anchors(self, params: Any) -> tuple[np.ndarray, np.ndarray] | None:
-        """Nodes and widths `(m, p)` of the patches of surface that it pulls on, to be drawn; None: none."""
+        """Nodes `(m, p)` and widths `(m, p)` of the patches of surface that it pulls on, to draw; None: none."""
         return None
 
 
 @dataclasses.dataclass(frozen=True)
 class BareFunction(Energy):
-    """A function `(x, params) -> scalar` as an energy that says nothing else of itself."""
+    """A function `(x, params) -> scalar` as an energy with the defaults of `Energy`."""
 
     function: Callable[[jax.Array, Any], jax.Array]
 
@@ -152,15 +158,15 @@ class BareFunction(Energy):
 
 @pytree
 class Term:
-    """`m` stencils that share one energy.
+    """`m` stencils that share one energy function.
 
     Args:
-        energy: an `Energy`, or a pure function `(x, params) -> scalar` of one stencil: `x` `(k, 2)` are the positions
-            of its nodes and `params` its parameters. Define the function at module level: a lambda made anew for
-            every scene would be compiled anew.
+        energy: an `Energy`, or a pure function `(x, params) -> scalar` of one stencil. `x` `(k, d)` are the positions
+            of its nodes, with `d` 2, or 3 on a rod, and `params` are its parameters. Define the function at module
+            level: a new lambda for every scene would compile again each time.
         nodes: `(m, k)` node numbers.
         params: any pytree of arrays with leading axis `m`. All of it is differentiable. Values that change
-            belong here, never in a closure, or each change compiles again.
+            belong here. In a closure, each new value would compile again.
 
     Raises:
         ValueError: if `nodes` is not a whole-number array of shape `(m, k)`, or an array of `params` has
@@ -195,18 +201,22 @@ class Term:
 
     @property
     def kind(self) -> Energy:
-        """The energy with all that it says of itself."""
+        """The energy as an `Energy`."""
         return self.energy if isinstance(self.energy, Energy) else BareFunction(self.energy)
 
     @property
     def command_count(self) -> int:
-        """How many commands it takes."""
+        """Number of commands that the term takes."""
         if self.kind.rest_command is None:
             return 0
         return 1 if self.kind.shared_command else len(self.nodes)
 
 
 def check_nodes(name: str, mesh: Mesh, nodes: Numbers, ndim: int) -> np.ndarray:
-    """`nodes` as a concrete array of valid node numbers with `ndim` axes, or a `ValueError` that names it."""
+    """`nodes` as a concrete array of valid node numbers with `ndim` axes.
+
+    Raises:
+        ValueError: if `nodes` is anything else. The message calls the argument `name`.
+    """
     checks.instance("mesh", mesh, Mesh, "a scene has it as scene.mesh")
     return checks.node_numbers(name, mesh.nodes.shape[0], nodes, ndim)

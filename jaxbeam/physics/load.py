@@ -17,10 +17,10 @@ from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 @pytree
 class PointParams:
-    """Of each loaded node: its rest position, and the load or the stiffness.
+    """Parameters of loaded nodes or of springs.
 
-    rest: `(m, d)`.
-    value: `(m, d)` force, or `(m,)` stiffness.
+    rest: `(m, d)` rest positions of the nodes.
+    value: `(m, d)` force on each node, or `(m,)` stiffness of each spring.
     """
 
     rest: jax.Array
@@ -29,7 +29,7 @@ class PointParams:
 
 @dataclasses.dataclass(frozen=True)
 class DeadLoadEnergy(Energy):
-    """`-f . (x - X)`: a force of constant size and direction on one node."""
+    """`-f . (x - X)`: a force `f` of constant size and direction on one node, with rest position `X`."""
 
     name: ClassVar[str] = "load"
 
@@ -48,10 +48,10 @@ def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
     """Constant forces on nodes.
 
     Args:
-        mesh: its rest positions are the zero of the load's energy.
+        mesh: at its rest positions the energy of the load is zero.
         nodes: `(m,)` node numbers.
-        force: `(2,)` on each of them, or `(m, 2)`; on a rod `(3,)` or `(m, 3)`, the third a moment over `radian`
-            (see `jaxbeam.mesh.line`); differentiable.
+        force: `(2,)`, the same on each node, or `(m, 2)`; on a rod `(3,)` or `(m, 3)`, where the third component is a
+            moment divided by `radian` (see `jaxbeam.mesh.line`); differentiable.
 
     Raises:
         ValueError: if a node is out of range or `force` has another shape or is not finite.

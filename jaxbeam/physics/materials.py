@@ -1,9 +1,9 @@
 """Elastic energy densities in plane strain, as pure functions of the displacement gradient.
 
-Each takes `H = F - I` `(2, 2)`, with `F` the deformation gradient, and `Lame` parameters, and returns the
-energy per unit rest volume (units of Young's modulus; thickness is 1). Written in `H`, small strains keep
-their digits: `J - 1 = tr H + det H`, and `(|F|^2 - 2) / 2 - (J - 1)` is `distortion`. All are differentiable to any
-order in `H` and in the parameters.
+Each takes `Lame` parameters and `H = F - I` `(2, 2)`, with `F` the deformation gradient. It returns the energy per unit
+rest volume (units of Young's modulus; thickness is 1). The formulas are evaluated in `H`, so that small strains keep
+their digits: `J - 1` is `tr H + det H`, and `distortion_and_volume` evaluates `(|F|^2 - 2) / 2 - (J - 1)`. All are
+differentiable to any order in `H` and in the parameters.
 """
 
 from __future__ import annotations
@@ -20,13 +20,17 @@ from jaxbeam.core.checks import POSITIVE, Range, function, numbers, scalar
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, to_device
 
-# Poisson's ratio of a stable material.
+# Range of Poisson's ratio of a stable material.
 POISSON = Range("a value in (-1, 0.5)", "a value in (-1, 0.5)", low=-1, high=0.5)
 
 
 @pytree
 class Lame:
-    """Lame parameters: shear modulus `mu` and first parameter `lam`, scalars or one for each element."""
+    """Lame parameters, in the unit of Young's modulus.
+
+    mu: `()` or `(t,)`, one for each element: shear modulus.
+    lam: `()` or `(t,)`: first Lame parameter.
+    """
 
     mu: jax.Array
     lam: jax.Array
@@ -69,20 +73,23 @@ def lame_macklin_mueller(young: Numbers, poisson: Numbers) -> Lame:
 
 
 def material_is_valid(material: Any) -> Any:
-    """Whether traced parameters of a material are in their range `()`: those of `lame`; of others nothing is known."""
+    """Whether the parameters of a material are in their range, `()`, for traced `Lame` parameters.
+
+    The range of other parameters is not known, so they pass.
+    """
     if not isinstance(material, Lame):
         return True
-    # 3 lam + 2 mu = E / (1 - 2 nu): with mu > 0 it is positive just when nu is in (-1, 0.5).
+    # 3 lam + 2 mu = E / (1 - 2 nu). If mu > 0, this is positive if and only if nu is in (-1, 0.5).
     return jnp.all((material.mu > 0) & (3 * material.lam + 2 * material.mu > 0))
 
 
 def distortion_and_volume(H: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`(|F|^2 - 2) / 2 - (J - 1)` and `J - 1`.
 
-    The first is half a sum of squares, zero where `F` only turns and stretches evenly. Summed up term by term it would
-    lose, in a body that turns, the digits of a small strain.
+    The first is zero if `F` is a rotation times a uniform stretch. It is evaluated as half a sum of squares. Evaluated
+    term by term, it would lose the digits of a small strain in a body that rotates.
     """
-    # Each entry is taken once: all derivatives repeat it.
+    # Index each entry only once, because every derivative repeats the indexing.
     a, b, c, d = H[0, 0], H[0, 1], H[1, 0], H[1, 1]
     return 0.5 * ((a - d) ** 2 + (b + c) ** 2), a + d + (a * d - b * c)
 
@@ -90,7 +97,7 @@ def distortion_and_volume(H: jax.Array) -> tuple[jax.Array, jax.Array]:
 def macklin_mueller(H: jax.Array, params: Lame) -> jax.Array:
     """Stable neo-Hookean, `mu/2 (|F|^2 - 2) - mu (J - 1) + lam/2 (J - 1)^2`.
 
-    Finite for every `F`, inverted ones too, so the smallest `J` must be watched. Linearised, its first
+    Finite for every `F`, also an inverted one, so the smallest `J` must be checked separately. Linearised, its first
     Lame parameter is `lam - mu`: see `lame_macklin_mueller`.
 
     Source: Macklin and Mueller, "A constraint-based formulation of stable neo-Hookean materials", MIG 2021.
@@ -113,9 +120,11 @@ def neo_hookean(H: jax.Array, params: Lame) -> jax.Array:
 
 @jax.custom_jvp
 def _less_log1p(v: jax.Array) -> jax.Array:
-    """`v - ln(1 + v)`, about `v^2 / 2`, without the cancellation that would eat the digits of small strains.
+    """`v - ln(1 + v)`, about `v^2 / 2`, without the cancellation that would lose the digits of small strains.
 
-    With `s = v / (2 + v)`, `ln(1 + v) = 2 atanh s` and `v - 2 s = s v`, so it is `s v - 2 (s^3/3 + s^5/5 + ...)`.
+    With `s = v / (2 + v)`, `ln(1 + v) = 2 atanh s` and `v - 2 s = s v`. So the result is
+
+        s v - 2 (s^3/3 + s^5/5 + ...).
     """
     small = jnp.abs(v) < 0.25
     w = jnp.where(small, v, 0)
@@ -135,11 +144,11 @@ def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array,
 def saint_venant_kirchhoff(H: jax.Array, params: Lame) -> jax.Array:
     """Saint Venant-Kirchhoff, `mu E:E + lam/2 (tr E)^2` with the Green strain `E = (H + H^T + H^T H)/2`.
 
-    Large rotations, small strains: it softens and inverts without resistance under strong compression.
+    For large rotations and small strains. Under strong compression it softens and inverts without resistance.
 
     Source: Bonet and Wood 2008, eq. 6.28.
     """
-    # Not H.T @ H: a product of small matrices, one for each element, is far slower than its loops.
+    # Not `H.T @ H`: mapped over elements, a product of small matrices is far slower than its loops over entries.
     strain = 0.5 * (H + H.T + jnp.sum(H[:, :, None] * H[:, None, :], axis=0))
     return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
 
@@ -150,27 +159,27 @@ def linear_elastic(H: jax.Array, params: Lame) -> jax.Array:
     return params.mu * jnp.sum(strain * strain) + 0.5 * params.lam * jnp.trace(strain) ** 2
 
 
-# --------------------------------------------------------------------------------- a density of one's own
+# --------------------------------------------------------------------------------- densities written by users
 
 
-_OWN = (macklin_mueller, neo_hookean, saint_venant_kirchhoff, linear_elastic)
+_PROVIDED = (macklin_mueller, neo_hookean, saint_venant_kirchhoff, linear_elastic)
 
 
 def check_density(density: Callable[[jax.Array, Any], jax.Array], material: Any) -> None:
-    """Refuse a density that returns no scalar, or that takes its argument for `F` where it gets `H = F - I`.
+    """Refuse a density that returns no scalar, or that is written in `F` although its argument is `H = F - I`.
 
-    It is asked for a few energies, of the first element, once for each density and parameters. Traced parameters are
-    taken to be 1.
+    The density is evaluated at a few `H`, with the parameters of the first element. This is done once for each density
+    and parameters. Traced parameters are replaced by 1.
 
     Args:
-        density: of a solid or a rod.
+        density: energy density of a solid or a rod.
         material: its parameters, with an entry for each element.
 
     Raises:
-        ValueError: if its value is not a scalar, is not finite at rest, `H = 0`, or is that of a density in `F`.
+        ValueError: if the value is not a scalar or is not finite at rest, `H = 0`, or the density is written in `F`.
     """
     function("density", density, "(H, params) -> scalar")
-    if density in _OWN:
+    if density in _PROVIDED:
         if not all(hasattr(getattr(material, name, None), "shape") for name in ("mu", "lam")):
             raise ValueError(
                 f"params: expected the mu and lam of {density.__name__}, such as lame(young, poisson), got {material!r}"
@@ -179,28 +188,35 @@ def check_density(density: Callable[[jax.Array, Any], jax.Array], material: Any)
     leaves, structure = jax.tree.flatten(material)
     first = tuple(np.asarray(leaf)[0] if is_concrete(leaf) else np.ones(leaf.shape[1:], leaf.dtype) for leaf in leaves)
     known = tuple((leaf.dtype.str, leaf.shape, np.asarray(leaf).tobytes()) for leaf in first)
-    _check_own(density, structure, known)
+    _check_user_density(density, structure, known)
 
 
 @lru_cache(maxsize=64)
-def _check_own(density: Callable[[jax.Array, Any], jax.Array], structure: Any, known: tuple[Any, ...]) -> None:
-    """`check_density` of one element's parameters, given by dtype, shape and bytes."""
+def _check_user_density(density: Callable[[jax.Array, Any], jax.Array], structure: Any, known: tuple[Any, ...]) -> None:
+    """The check of `check_density`, with the parameters of one element in a hashable form.
+
+    Args:
+        density: as for `check_density`.
+        structure: pytree structure of the parameters.
+        known: dtype, shape and bytes of each leaf.
+    """
     leaves = [np.frombuffer(data, dtype).reshape(shape) for dtype, shape, data in known]
     material = jax.tree.unflatten(structure, leaves)
     dtype = leaves[0].dtype if leaves else jnp.result_type(float)
     scalar("density", "(H, params)", density, jax.ShapeDtypeStruct((2, 2), dtype), material)
-    one, turn, strained = np.eye(2), _turned(1.0), np.array([[1.3, 0.2], [-0.1, 0.9]])
+    one, turn, strained = np.eye(2), _rotation(1.0), np.array([[1.3, 0.2], [-0.1, 0.9]])
     states = np.stack([0 * one, turn - one, one, strained, turn @ strained]).astype(dtype)
     try:
         with jax.ensure_compile_time_eval():
             found = _energies(density, states, material)
     except FloatingPointError:
-        # So `jax_debug_nans` says that a value is not a number.
+        # Raised for a NaN if `jax_debug_nans` is set.
         found = np.full(len(states), np.nan)
     if not is_concrete(found):
         return
     rest, turned, unit, before, after = np.asarray(found).tolist()
-    # A density in F does not see a rotation of F, and one in H none of H + I.
+    # A density in F keeps its value if a rotation multiplies its argument. A density in H keeps its value if a rotation
+    # multiplies H + I.
     same = lambda a, b: abs(a - b) <= 1e3 * float(jnp.finfo(dtype).eps) * (abs(a) + abs(b) + abs(rest - unit))
     in_f = same(before, after) and not same(rest, turned) and unit < rest
     if in_f or not np.isfinite(rest):
@@ -215,5 +231,5 @@ def _energies(density: Callable[[jax.Array, Any], jax.Array], states: jax.Array,
     return jax.vmap(lambda H: density(H, material))(states)
 
 
-def _turned(angle: float) -> np.ndarray:
+def _rotation(angle: float) -> np.ndarray:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

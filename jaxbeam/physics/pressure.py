@@ -1,13 +1,13 @@
-"""Pressure on the surface of a body. It stays normal to the surface as that moves.
+"""Pressure on the surface of a body: a follower load, which stays normal to the surface as the surface moves.
 
-A pressure `p` pushes a piece `dx` of the surface, which has the body to its left, with `p (-dy, dx)`. On a surface that
-closes a loop, or ends at nodes that do not move, this force has a potential (Schweizerhof and Ramm, Computers &
-Structures 18 (1984), 1099-1114): `p` times the area on the body's side,
+The body lies to the left of a piece `(dx, dy)` of its surface. A pressure `p` acts on it with the force `p (-dy, dx)`.
+This force has a potential if the loaded line is closed or ends at nodes that do not move (Schweizerhof and Ramm,
+Computers & Structures 18 (1984), 1099-1114). The potential is `p` times the area on the body's side,
 
     E = p / 2 int (x - c) cross dx,
 
-whatever the point `c`. So the stiffness is symmetric, and the solver needs to know nothing of pressure. On a line with
-an end that moves there is none.
+with vectors `x` and `dx` and any point `c`. So the stiffness is symmetric, and the solver needs to know nothing of
+pressure. On a line with an end that moves there is no potential.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 @pytree
 class PressureParams:
-    """Of each edge: pressure `(m,)`, all alike, and centre `(m, 2)`, the point that areas are measured from."""
+    """Parameters of the loaded edges.
+
+    pressure: `(m,)` pressure, the same on all edges.
+    centre: `(m, 2)` the point `c` from which areas are measured, the same for all edges.
+    """
 
     pressure: jax.Array
     centre: jax.Array
@@ -38,7 +42,7 @@ class PressureParams:
 
 @dataclasses.dataclass(frozen=True)
 class PressureEnergy(Energy):
-    """`p` times the area between one edge of the surface and the centre. Its command is the pressure."""
+    """`p` times the signed area between one edge of the surface and the centre. The command is the pressure."""
 
     name: ClassVar[str] = "pressure"
     coordinates: ClassVar[int | None] = 2
@@ -50,14 +54,14 @@ class PressureEnergy(Energy):
         return 0.5 * params.pressure * jnp.sum((x - params.centre) * self._normals(x - params.centre))
 
     def gradients(self, x: jax.Array, params: PressureParams) -> tuple[jax.Array, jax.Array]:
-        # Those of the energy of one edge depend on the centre, and cancel between neighbours but at the ends of a line.
-        # These are the forces of the pressure on the edge: of their true size, so that residuals are relative to it,
-        # and right at clamped ends, so that reactions are.
+        # The gradient of the energy of one edge contains terms that depend on the centre. They cancel between
+        # neighbouring edges, but not at the ends of a line. So this returns minus the force of the pressure on the edge
+        # instead. It has the true size, which residuals are relative to, and gives the right reactions at clamped ends.
         forces = params.pressure[:, None, None] * self._normals(x)
         return jax.vmap(self)(x, params), forces
 
     def _normals(self, x: jax.Array) -> jax.Array:
-        """For each node `(..., k, 2)` of an edge, `int N_i (dy, -dx)`: out of the body, as long as its share."""
+        """`int N_i (dy, -dx)` `(..., k, 2)` for each node `i` of an edge: its share of the edge's outward normal."""
         products = jnp.asarray(edge_products(x.shape[-2]), x.dtype)
         along = jnp.sum(products[:, :, None] * x[..., None, :, :], axis=-2)
         return jnp.stack([along[..., 1], -along[..., 0]], axis=-1)
@@ -101,12 +105,12 @@ def pressure(mesh: Mesh, nodes: Numbers, value: Numbers = 0.0) -> Term:
 
     Args:
         mesh: of triangles.
-        nodes: `(m,)` node numbers. It acts on the edges of the surface of which both corners are among them.
-        value: force per length (thickness 1), positive where it pushes on the body; differentiable.
+        nodes: `(m,)` node numbers. The pressure acts on the edges of the surface whose two corners are among them.
+        value: force per length (thickness 1), positive if it pushes on the body; differentiable.
 
     Raises:
         ValueError: if a node is out of range, no edge of the surface lies between the nodes, or `value` is not a finite
-            number; and by `Scene`, if the edges form a line with an end that moves.
+            number. `Scene` raises it if the edges form a line with an end that moves.
     """
     chosen = check_nodes("nodes", mesh, nodes, ndim=1)
     value = checks.number("value", value)

@@ -1,8 +1,8 @@
-"""Nearest positive semidefinite matrices in the Frobenius norm (Higham 1988): negative eigenvalues to 0.
+"""Nearest positive semidefinite matrices in the Frobenius norm (Higham 1988): negative eigenvalues are set to 0.
 
-Newton's method takes a share of them where the energy is not convex. What is projected is the smallest piece that
-carries the lack of convexity: for a solid the second derivative of its density in `H = F - I`, four by four at each
-quadrature point (Teran, Sifakis, Irving and Fedkiw 2005), and for any other term the whole stencil's Hessian.
+Where the energy is not convex, Newton's method blends the Hessian with a projected one. For a solid, what is projected
+is the second derivative of the density in `H = F - I`, four by four at each quadrature point (Teran, Sifakis, Irving
+and Fedkiw 2005). For any other term it is the Hessian of the whole stencil.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-# Sweeps over all pairs of rows, beyond their number: the method converges quadratically, and larger matrices later.
-# After six, four by four are at round-off.
+# Jacobi's method makes this many more sweeps over all pairs of rows than the matrix has rows. Its convergence is
+# quadratic, but sets in later for larger matrices. Matrices of four by four reach round-off in six sweeps.
 SWEEPS = 2
 
 
@@ -24,17 +24,17 @@ def project_each(matrices: jax.Array) -> jax.Array:
         values, vectors = jnp.linalg.eigh(matrix)
         return (vectors * jnp.maximum(values, 0)) @ vectors.T
 
-    # A batched eigh shares XLA's threads out among its matrices and waits for them: two programs that run side by side,
-    # as in a sweep, then wait for each other for ever (jaxlib 0.10 on a processor of two cores).
+    # Not a batched eigh: it distributes its matrices over XLA's threads and waits for these. Two programs that run side
+    # by side, as in a sweep, can then wait for each other for ever (jaxlib 0.10 on a processor of two cores).
     return lax.map(one, matrices)
 
 
 def project_many(matrices: jax.Array) -> jax.Array:
     """Projections of many small symmetric matrices `(s, s, m)` at once, `s` even, by Jacobi's method.
 
-    All disjoint pairs of rows are turned together, and rows then change places so that every pair meets within
-    `s - 1` turns (Brent and Luk 1985, SIAM J. Sci. Stat. Comput. 6). Matrices are the last axis: a turn is a few
-    vectorised loops over them, a tenth of what calls of LAPACK take.
+    Each step rotates `s / 2` disjoint pairs of rows together. Then the rows change places, so that each pair is rotated
+    once in `s - 1` steps (Brent and Luk 1985, SIAM J. Sci. Stat. Comput. 6). Matrices are the last axis, so a step is a
+    few vectorised loops over them. This takes a tenth of the time of calls to LAPACK.
     """
     s = len(matrices)
     upper, lower = np.arange(0, s, 2), np.arange(1, s, 2)

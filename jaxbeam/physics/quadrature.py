@@ -1,13 +1,13 @@
 """Derivatives of energies that are a density summed over quadrature points.
 
-Such an energy depends on positions through `H = F - I` alone, four numbers a quadrature point, so its density is
-differentiated in these and the chain rule does the rest:
+Such an energy depends on positions only through `H = F - I`, four numbers at each quadrature point. So the density
+`psi` is differentiated in these four numbers, and the chain rule gives
 
     dE/dx_ai = sum_q w g_ak P_ik,     d2E/dx_ai dx_bj = sum_q w g_ak D_ikjl g_bl,
 
-with `P = d psi / d H`, `D = d2 psi / d H2` and `g` the gradients of the shape functions (summed over `k`, `l`). Each
-component is a separate scalar until the end, and elements are the last axis of every array: XLA makes a few vectorised
-loops of it, more than ten times as fast as derivatives by six coordinates.
+with `P = d psi / d H`, `D = d2 psi / d H2`, `w` the weights and `g` the gradients of the shape functions (summed over
+`k`, `l`). Each component is a separate scalar until the end, and elements are the last axis of every array. XLA makes a
+few vectorised loops of this, more than ten times as fast as derivatives by the six coordinates of a triangle.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ from jaxbeam.physics.projection import project_many
 
 @pytree
 class SolidParams:
-    """Parameters of elements with `k` nodes and `q` quadrature points (leading axis `m` in a `Term`).
+    """Parameters of `m` elements with `k` nodes and `q` quadrature points.
 
-    rest `(m, k, 2)`: rest positions. gradients `(m, q, k, 2)`: shape-function gradients in the rest frame.
-    weights `(m, q)`: quadrature weight times rest area. material: pytree with leading axis `m`.
+    rest: `(m, k, 2)` rest positions.
+    gradients: `(m, q, k, 2)` gradients of the shape functions in the rest positions.
+    weights: `(m, q)` quadrature weight times rest area.
+    material: pytree of the density's parameters with leading axis `m`.
     """
 
     rest: jax.Array
@@ -43,21 +45,21 @@ Density = Callable[[jax.Array, Any], jax.Array]
 
 
 def mapped(nodes: Any, elements: np.ndarray, degree: int) -> tuple[Any, Any, Any]:
-    """Quadrature on elements, by the rule of a degree. Differentiable in the nodes.
+    """Shape-function gradients and weights at the quadrature points of elements. Differentiable in the nodes.
 
     Args:
         nodes: `(n, 2)` rest positions.
         elements: `(m, k)` node numbers.
-        degree: of the polynomials on the reference element that the rule integrates exactly.
+        degree: degree of the polynomials on the reference element that the quadrature rule integrates exactly.
 
     Returns:
-        Rest positions `(m, k, 2)`; gradients of the shape functions `(m, q, k, 2)`; weights times area `(m, q)`.
+        The `rest`, `gradients` and `weights` of `SolidParams`.
     """
     xp, element = namespace(nodes), element_of(elements)
     points, shares = element.rule(degree)
     rest = xp.asarray(nodes)[elements]
-    # The map from the reference element and its inverse, at each point. Positions count from the first node, so that a
-    # body far from the origin loses no digits.
+    # Derivative of the map from the reference element at each point, and its inverse. Positions are relative to the
+    # first node, so that a body far from the origin loses no digits.
     slopes = xp.asarray(element.slopes(points), nodes.dtype)
     map_ = xp.einsum("mkd,qki->mqdi", rest - rest[:, :1], slopes)
     determinant = map_[..., 0, 0] * map_[..., 1, 1] - map_[..., 0, 1] * map_[..., 1, 0]
@@ -78,7 +80,8 @@ def energies_and_gradients(density: Density, x: jax.Array, params: SolidParams) 
 def hessians(density: Density, x: jax.Array, params: SolidParams, convex: bool) -> jax.Array:
     """Hessians `(2 k, 2 k, m)` of elements at positions `x` `(m, k, 2)`.
 
-    With `convex`, the second derivatives at each point are projected, which makes them positive semidefinite.
+    If `convex`, the second derivatives of the density at each point are projected, so the Hessians are positive
+    semidefinite.
     """
     m, k, d = x.shape
     gradients, weights, stiffness = _at_points(_stiffness, density, x, params)
@@ -86,7 +89,7 @@ def hessians(density: Density, x: jax.Array, params: SolidParams, convex: bool) 
     if convex:
         second = project_many(second.reshape(4, 4, -1))
     second = weights * second.reshape(2, 2, 2, 2, *weights.shape)
-    # (a, i, j, l) and then (a, i, b, j); the last two axes are the points and the elements.
+    # Axes (a, i, j, l) of `half` and (a, i, b, j) of `whole`, each followed by the points and the elements.
     left, right = gradients[:, :, None, None, None], gradients[None, None, :, None]
     half = left[:, 0] * second[None, :, 0] + left[:, 1] * second[None, :, 1]
     whole = half[:, :, None, :, 0] * right[:, :, :, :, 0] + half[:, :, None, :, 1] * right[:, :, :, :, 1]
@@ -96,7 +99,14 @@ def hessians(density: Density, x: jax.Array, params: SolidParams, convex: bool) 
 def _at_points(
     derivative: Callable[..., list[jax.Array]], density: Density, x: jax.Array, params: SolidParams
 ) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
-    """Shape-function gradients `(k, 2, q, m)`, weights `(q, m)`, and a derivative of the density at each point."""
+    """Shape-function gradients `(k, 2, q, m)`, weights `(q, m)`, and the components `(q, m)` of a derivative.
+
+    Args:
+        derivative: `(density, H, material) -> components`, at one point.
+        density: as in `SolidEnergy`.
+        x: `(m, k, 2)` positions.
+        params: parameters of the elements.
+    """
     gradients = shape_gradients(params)
     H = interpolated(gradients, x - params.rest)
     components = [H[i, k] for i in range(2) for k in range(2)]
@@ -111,20 +121,22 @@ def shape_gradients(params: SolidParams) -> jax.Array:
 
 
 def interpolated(gradients: jax.Array, field: jax.Array) -> jax.Array:
-    """Gradient `(2, 2, q, m)` of a field `(m, k, 2)`, from those of the shape functions `(k, 2, q, m)`."""
+    """Gradient `(2, 2, q, m)` of a nodal `field` `(m, k, 2)`, from the `shape_gradients` `(k, 2, q, m)`."""
     nodes = zip(jnp.moveaxis(field, 0, -1), gradients, strict=True)
     return functools.reduce(jnp.add, (values[:, None, None] * slopes for values, slopes in nodes))
 
 
 def _over_points(values: jax.Array) -> jax.Array:
-    """The sum over quadrature points of `(..., q, m)`. Written out: XLA's own takes several times as long."""
+    """Sum of `(..., q, m)` over the quadrature points, written out: XLA's own sum takes several times as long."""
     return functools.reduce(jnp.add, (values[..., q, :] for q in range(values.shape[-2])))
 
 
 @functools.lru_cache(maxsize=64)
 def _of_components(density: Callable[[jax.Array, Any], jax.Array]) -> Callable[[list[jax.Array], Any], jax.Array]:
-    """The density as a function of the four components of `H`. Jitted, so that it is traced once for all of its
-    derivatives."""
+    """The density as a function of the four components of `H`.
+
+    It is jitted, so that it is traced only once for all of its derivatives.
+    """
     return jax.jit(lambda H, material: density(jnp.stack([jnp.stack(H[:2]), jnp.stack(H[2:])]), material))
 
 

@@ -28,9 +28,9 @@ from jaxbeam.physics.tendon import (
 
 @pytree
 class Offsets:
-    """Where the points of tendons lie.
+    """Positions of the points of tendons on the sections of a rod.
 
-    eccentricity: `(m, k)` along the section from its node, to the left of the axis.
+    eccentricity: `(m, k)` distance of each point from its node, along the section to the left of the axis.
     radian: `(m,)` as in `Line`.
     """
 
@@ -39,7 +39,7 @@ class Offsets:
 
 
 def at_offsets(x: jax.Array, attachment: Offsets) -> jax.Array:
-    """The points `(..., k, 2)` of a tendon at nodes `(..., k, 3)`."""
+    """The points `(..., k, 2)` of a tendon whose nodes have coordinates `x` `(..., k, 3)`."""
     return beside(x, attachment.eccentricity, attachment.radian)
 
 
@@ -71,8 +71,8 @@ def rod_tendons(
     """Tendons beside the axis of a rod, at their natural length (ratio 1); `command` shortens them.
 
     Args:
-        line: natural lengths are measured on its rest positions, and differentiable in them.
-        nodes: `(m, k)` node numbers: of the two ends of each tendon, with any guides between.
+        line: its rest positions determine the natural lengths, which are differentiable in them.
+        nodes: `(m, k)` node numbers: for each tendon its first end, any guides, and its second end.
         eccentricity: distance of each point from its node, to the left of the axis; scalar or `(m, k)`; differentiable.
         modulus: as for `tendons`.
         stiffness: as for `tendons`.
@@ -80,8 +80,8 @@ def rod_tendons(
     Raises:
         ValueError: if `eccentricity` has another shape or is not finite, or as `tendons` does.
     """
-    # It checks the nodes and the modulus. Lengths are measured anew.
     checks.instance("line", line, Line, "on a mesh of triangles use tendons")
+    # `tendons` checks the nodes and the modulus. Its lengths, measured between nodes, are replaced below.
     plain = tendons(line, nodes, modulus, stiffness)
     eccentricity = checks.numbers(
         "eccentricity", eccentricity, shapes=((), plain.nodes.shape), each="one for each point"

@@ -21,15 +21,15 @@ from jaxbeam.physics.materials import check_density, macklin_mueller, material_i
 from jaxbeam.physics.quadrature import Density, SolidParams, mapped
 from jaxbeam.physics.volume import admissible_step, rest_is_sound, smallest_ratios
 
-# An element under this `J` is let through zero, where its energy allows that: held back, it would be approached in ever
-# smaller steps. It may well come back, and if it does not, the solution says so. Away from the quadrature points every
-# energy allows it.
+# An element whose `J` is at most this may pass through `J = 0`, if its density is finite there. If it were held back,
+# steps towards `J = 0` would get ever smaller. The element may recover later. If it does not, the solution reports it.
+# Between the quadrature points the density is not evaluated, so every density allows `J = 0` there.
 RELEASED = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class SolidEnergy(Energy):
-    """Energy of one element: the density summed over its quadrature points. What must stay positive is `J`."""
+    """Energy of one element: the density summed over its quadrature points. Its margin is the smallest `J`."""
 
     density: Density
     name: ClassVar[str] = "solid"
@@ -54,8 +54,11 @@ class SolidEnergy(Energy):
         return smallest_ratios(x, params)
 
     def longest_step(self, x: jax.Array, dx: jax.Array, params: SolidParams, keep: float) -> jax.Array:
-        """Quadrature points of a density that forbids inversion always keep their share; all else only while `J` is
-        over `RELEASED`."""
+        """The largest `t` `(m,)` for which `x + t dx` keeps the fraction `keep` of `J`.
+
+        A quadrature point is ignored if its `J` is at most `RELEASED`, unless the density forbids inversion. The rest
+        of an element is ignored if its smallest `J` is at most `RELEASED`.
+        """
         bound = 0.0 if forbids_inversion(self.density, params) else RELEASED
         return admissible_step(x, dx, params, keep, bound, RELEASED)
 
@@ -73,10 +76,10 @@ class SolidEnergy(Energy):
 
 
 def forbids_inversion(density: Density, params: SolidParams) -> bool:
-    """Whether the density is infinite or undefined for an inverted element, as a logarithmic one is."""
+    """Whether the density is infinite or NaN in an inverted element, as a logarithmic density is."""
     ones = jax.tree.map(lambda leaf: np.ones(leaf.shape[1:], leaf.dtype), params.material)
     inverted = np.array([[-1.5, 0.0], [0.0, 0.0]], params.rest.dtype)
-    # That it may be NaN is what is asked.
+    # A NaN is an expected result here, so `jax_debug_nans` must not raise.
     with jax.ensure_compile_time_eval(), jax.debug_nans(False):
         return not np.isfinite(jax.jit(density)(inverted, ones))
 
@@ -93,20 +96,20 @@ def solid(
     density: Density = macklin_mueller,
     degree: int | None = None,
 ) -> Term:
-    """The body itself.
+    """The elastic body.
 
     Args:
-        mesh: with nodes `(n, 2)`; differentiable in them.
+        mesh: mesh of triangles with nodes `(n, 2)`; differentiable in them.
         params: the density's parameters, such as `lame(young, poisson)`: a pytree whose leaves are scalars
             or have leading axis `t`, one entry for each element. Cast to the dtype of the nodes.
         density: `(H, params) -> scalar`, one of `jaxbeam.physics.materials` or your own module-level function.
-        degree: of the polynomials in the density that the quadrature takes exactly, one that the element has a rule
-            for: 1, 2, 4 or 5. By default 1 (one point) for triangles of three nodes, where that is exact for any
-            density, and 2 (three points) for six.
+        degree: degree of polynomials that the quadrature integrates exactly; triangles have rules for 1, 2, 4 and 5. By
+            default 1 (one point) for triangles of three nodes, where that is exact for any density, and 2 (three
+            points) for triangles of six.
 
     Raises:
         ValueError: if a parameter is neither a scalar nor of leading axis `t` or is not finite, there is no rule of
-            that degree, or the density returns no scalar or is not that of `H = F - I`.
+            that degree, or the density returns no scalar or is not written in `H = F - I`.
     """
     check_triangles(mesh)
     element = element_of(mesh.elements)

@@ -18,7 +18,7 @@ from jaxbeam.physics.load import PointParams
 
 @dataclasses.dataclass(frozen=True)
 class SpringEnergy(Energy):
-    """`1/2 k |x - X|^2`: a spring from one node to its rest position."""
+    """`1/2 k |x - X|^2`: a spring of stiffness `k` from one node to its rest position `X`."""
 
     name: ClassVar[str] = "spring"
 
@@ -36,8 +36,8 @@ class SpringEnergy(Energy):
 def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
     """Springs that hold nodes near their rest positions: a soft clamp.
 
-    A clamp in `Scene.fixed` is exact and cheaper. This one, at the usual 1e9, shifts the reference angle
-    by 2e-6 degrees and rules out float32; it is here for comparison with codes that clamp so.
+    A clamp in `Scene.fixed` is exact and cheaper. Springs of the usual stiffness 1e9 shift the reference angle by
+    2e-6 degrees and rule out float32. They are meant for comparison with codes that clamp in this way.
 
     Args:
         mesh: gives the rest positions.

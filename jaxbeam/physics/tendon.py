@@ -1,7 +1,7 @@
 """Tendons: springs along a line through points of a body, commanded by their rest length.
 
-A tendon's tension is positive when it pulls its ends together. These tendons are two-way: one that is longer than its
-ends are apart pushes.
+A tendon's tension is positive if it pulls its ends together. These tendons are two-way: a tendon whose commanded length
+exceeds the length of its line pushes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 @pytree
 class TendonParams:
-    """Parameters of tendons (leading axis `m` in a `Term`), all differentiable but the last two.
+    """Parameters of `m` tendons, all differentiable except `width` and `ends`.
 
-    natural: length at rest (ratio 1). commanded: rest length asked for now, `ratio * natural`.
-    modulus: the coefficient of the tendon's stiffness law.
-    attachment: what the energy's `points` needs to know; none for tendons fixed to nodes.
-    ends, width `(m, k)`: the node and the width of each anchor, if there are any of finite width.
+    natural: `(m,)` length of the tendon when the body is at rest (ratio 1).
+    commanded: `(m,)` commanded rest length, `ratio * natural`.
+    modulus: `(m,)` coefficient of the stiffness law.
+    attachment: argument of the energy's function `points`, leading axis `m`; None for tendons fixed to nodes.
+    width: `(m, p)` width of each anchor; None if no anchor has a finite width.
+    ends: `(m, p)` node of each anchor; None if no anchor has a finite width.
     """
 
     natural: jax.Array
@@ -43,7 +45,7 @@ class TendonParams:
 
 
 def inverse_square_stiffness(modulus: jax.Array, commanded: jax.Array) -> jax.Array:
-    """`k = modulus / commanded^2`: the reference law. It grows as the tendon is shortened."""
+    """`k = modulus / commanded^2`: the law of the reference scene. The stiffness grows as the tendon is shortened."""
     return modulus / commanded**2
 
 
@@ -61,7 +63,7 @@ _LAWS = (inverse_square_stiffness, inverse_stiffness, constant_stiffness)
 
 
 def check_law(stiffness: Callable[[jax.Array, jax.Array], jax.Array]) -> None:
-    """Refuse what is not a law of stiffness, a function of two numbers that returns one."""
+    """Raise `ValueError` if `stiffness` is not a function of two numbers that returns one number."""
     form = "(modulus, commanded) -> k, such as inverse_square_stiffness"
     checks.function("stiffness", stiffness, form)
     if stiffness not in _LAWS:
@@ -74,16 +76,19 @@ def at_nodes(x: jax.Array, attachment: None) -> jax.Array:
 
 
 def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
-    """The points `(p, 2)` of a tendon that are weighted means, by weights `(p, k)`, of its `k` nodes."""
+    """The points `(p, 2)` of a tendon as means of its `k` nodes, with weights `attachment` `(p, k)`."""
     return jnp.sum(attachment[:, :, None] * x, axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class TendonEnergy(Energy):
-    """`1/2 k (l - l*)^2` of one two-way tendon: `l` the length of the line through its points, `l*` the
-    commanded length, `k = stiffness(modulus, l*)`. Longer than its ends are apart, it pushes.
+    """Energy of one two-way tendon, `1/2 k (l - l*)^2` with `k = stiffness(modulus, l*)`.
 
-    Its command is the ratio `l*` over the natural length.
+    `l` is the length of the line through its points, and `l*` the commanded length. The command is the ratio of `l*` to
+    the natural length.
+
+    stiffness: the law `(modulus, commanded) -> k`.
+    points: from the nodes `x` of the tendon and its `attachment`, the points of its line.
     """
 
     stiffness: Callable[[jax.Array, jax.Array], jax.Array]
@@ -104,7 +109,7 @@ class TendonEnergy(Energy):
         return polyline_length(self.points(from_first(x), params.attachment))
 
     def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        """`dE/dl = k (l - l*)` `()`, positive when it pulls."""
+        """Tension `dE/dl = k (l - l*)` `()`, positive if the tendon pulls."""
         return self.stiffness(params.modulus, params.commanded) * (self.length(x, params) - params.commanded)
 
     def command(self, params: TendonParams, values: jax.Array) -> TendonParams:
@@ -145,15 +150,17 @@ class TendonEnergy(Energy):
 
 
 def from_first(x: Any) -> Any:
-    """Nodes `(..., k, d)` with places measured from the first. Points beside nodes, and means of them, would lose the
-    digits that tell them apart if they were computed far from the origin."""
+    """Coordinates `(..., k, d)` of nodes, with positions relative to the first node and angles as they are.
+
+    Points beside nodes, and means of nodes, would lose digits if they were computed far from the origin.
+    """
     return x - x[..., :1, :] * np.array([1.0, 1.0, 0.0], x.dtype)[: x.shape[-1]]
 
 
 def polyline_length(x: jax.Array) -> jax.Array:
     """Length `(...)` of the line through the points `x` `(..., k, 2)`.
 
-    Where two neighbours meet the length has no derivative; there it and every higher one is zero, not NaN.
+    A segment of zero length has no derivative. Its derivatives of all orders are set to zero here, instead of NaN.
     """
     xp = namespace(x)
     squared = xp.sum((x[..., 1:, :] - x[..., :-1, :]) ** 2, axis=-1)
@@ -172,14 +179,15 @@ def tendons(
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
 
     Args:
-        mesh: natural lengths are measured on its rest positions, and differentiable in them.
-        nodes: `(m, k)` node numbers: the two ends of each tendon, with any guides between.
+        mesh: its rest positions determine the natural lengths, which are differentiable in them.
+        nodes: `(m, k)` node numbers: for each tendon its first end, any guides, and its second end.
         modulus: coefficient of the stiffness law, positive; scalar or `(m,)`.
         stiffness: the law `(modulus, commanded) -> k`, such as `inverse_square_stiffness` (of the reference
             scene; unit of modulus: force x length), `inverse_stiffness` (force) or `constant_stiffness`
-            (force / length). Tendons of another law are another term.
-        width: of the patch of surface that each node stands for (see `jaxbeam.mesh.surface`), scalar or `(m, k)`. At
-            0 the tendon pulls on the node alone: a point load, whose answer has no limit as the mesh is refined.
+            (force / length). Tendons with another law need a term of their own.
+        width: width of the patch of surface that each node stands for (see `jaxbeam.mesh.surface`); scalar or `(m, k)`.
+            At 0 the tendon pulls on the node alone. This is a point load: its answer has no limit as the mesh is
+            refined.
 
     Raises:
         ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
@@ -204,7 +212,7 @@ def tendons(
         nodes_of, energy = lines, TendonEnergy(stiffness)
         natural = polyline_length(rest[lines])
     else:
-        nodes_of, weights = _means(mesh, lines, widths)
+        nodes_of, weights = _patch_means(mesh, lines, widths)
         energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
         places = from_first(np.asarray(rest)[nodes_of])
         natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, places).astype(dtype))
@@ -213,15 +221,21 @@ def tendons(
     return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
 
 
-def _means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes `(m, k)` of the patches of each tendon, and the weights `(m, p, k)` of its `p` points."""
+def _patch_means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes `(m, k)` of all patches of each tendon, and their weights `(m, p, k)` in its `p` points.
+
+    Args:
+        mesh: with concrete nodes.
+        lines: `(m, p)` node of each anchor.
+        widths: `(m, p)` width of each anchor.
+    """
     found = [
         [patch(mesh, int(node), float(width)) for node, width in zip(*pair, strict=True)]
         for pair in zip(lines, widths, strict=True)
     ]
     unions = [np.unique(np.concatenate([nodes for nodes, _ in line])) for line in found]
     most = max(len(union) for union in unions)
-    # Filled up with the last node, at weight 0.
+    # Tendons with fewer nodes are padded with their last node, at weight 0.
     nodes = np.stack([np.append(union, np.full(most - len(union), union[-1])) for union in unions])
     weights = np.zeros((*lines.shape, most))
     for k, line in enumerate(found):

@@ -1,8 +1,7 @@
 """`J = det F` of elements: its smallest value anywhere, and how far a step may go before it falls too low.
 
 In a triangle of three nodes `J` is one number. In other elements it is a ratio of two polynomials, whose smallest value
-the element's record finds (`jaxbeam.mesh.element`). The quadrature points alone do not show that an element is turned
-inside out between them.
+`jaxbeam.mesh.element` finds. The quadrature points alone do not suffice: an element may be inverted between them.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ def volume_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
 
 
 def smallest_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
-    """The smallest `J` `(m,)` anywhere in each element, quadrature point or not, at positions `x` `(m, k, 2)`.
+    """The smallest `J` `(m,)` anywhere in each element, not only at quadrature points, at positions `x` `(m, k, 2)`.
 
-    Unless `J` is constant on an element, it is the smallest ratio of two polynomials: by how much the present map and
-    that of the rest positions stretch area. Positive just when no part of the element is turned inside out.
+    If `J` varies on an element, it is the ratio of two polynomials: the determinants of the maps from the reference
+    element to `x` and to the rest positions. The result is positive if and only if no part of the element is inverted.
     """
     determinant = element_of(x).determinant
     if determinant is None:
@@ -35,7 +34,7 @@ def smallest_ratios(x: jax.Array, params: SolidParams) -> jax.Array:
 
 
 def rest_is_sound(params: SolidParams) -> jax.Array:
-    """Whether each element `(m,)` has positive area, and none of it is turned inside out, at rest."""
+    """Whether each element `(m,)` has positive area and no inverted part at rest."""
     positive = jnp.all(params.weights > 0, axis=1)
     determinant = element_of(params.rest).determinant
     if determinant is None:
@@ -44,32 +43,35 @@ def rest_is_sound(params: SolidParams) -> jax.Array:
 
 
 def _stretch(determinant: Determinant, x: jax.Array, params: SolidParams) -> jax.Array:
-    """Coefficients `(b, m)` of the determinant of the map at `x` `(m, k, 2)`, over its mean at rest."""
+    """Coefficients `(b, m)` of the determinant of the map to `x` `(m, k, 2)`, divided by its mean at rest."""
     slopes = determinant.slopes(jnp.moveaxis(x, 0, -1))
     return determinant.coefficients(slopes, slopes) / _rest_stretch(params)
 
 
 def _rest_stretch(params: SolidParams) -> jax.Array:
-    """The mean determinant `(1, m)` of the map of each element at rest. Divided by it, others are of order 1 whatever
-    the unit of length."""
+    """The mean determinant `(1, m)` of the map of each element at rest.
+
+    Determinants divided by it are of order 1 in any unit of length.
+    """
     return jnp.sum(params.weights, axis=1)[None] / element_of(params.rest).area
 
 
 def admissible_step(
     x: jax.Array, dx: jax.Array, params: SolidParams, keep: float, bound: float = 0.0, inside: float = 0.0
 ) -> jax.Array:
-    """Largest `t` `(m,)` for which no point of an element falls below `keep` times its present `J` on `x + t dx`.
+    """Largest `t` `(m,)` for which `J` stays at least `keep` times its value at `x`, from `x` to `x + t dx`.
 
-    Infinite where `J` never falls so far. Elements on which `J` varies are not looked at beyond `t = 1`, and away from
-    their quadrature points `J` may fall somewhat lower: to half of `keep` times the smallest `J` in the element.
+    This holds at every point of an element. `t` is infinite if `J` never falls so far. There are two exceptions for
+    elements on which `J` varies. `t` is at most 1. Between the quadrature points `J` may be lower, by half of `keep`
+    times the smallest `J` of the element.
 
     Args:
         x: `(m, k, 2)` positions of the nodes of each element.
         dx: `(m, k, 2)` the step.
-        params: of the elements.
-        keep: fraction of `J`.
-        bound: quadrature points where `J` is at or under it already are left out.
-        inside: of elements whose smallest `J` is at or under it only the quadrature points are looked at.
+        params: parameters of the elements.
+        keep: the fraction of `J`.
+        bound: quadrature points with `J` of at most `bound` at `x` are ignored.
+        inside: in elements whose smallest `J` is at most `inside` at `x`, only the quadrature points are checked.
     """
     gradients = shape_gradients(params)
     H, D = interpolated(gradients, x - params.rest), interpolated(gradients, dx)
@@ -91,18 +93,30 @@ def _step_within(
     keep: float,
     bound: float,
 ) -> jax.Array:
-    """The largest `t` `(m,)`, up to `start` and 1, by all points of elements on which `J` varies.
+    """`admissible_step` for elements on which `J` varies, with all their points: at most `start` and at most 1.
 
-    At each point `J(t) = J + b t + c t^2` is no less than the smallest of `J`, `J + b T / 2` and `J(T)` for `t` up to
-    `T`, its Bernstein coefficients. The last two are polynomials on the element. `T` is cut to where they
-    reach `keep J` at the point where they are below it most, again and again, until they are nowhere below by more than
-    half of `keep` times the smallest `J`. Each cut is 2 % at least, so that round-off does not keep it from ending.
+    At each point `J(t) = J + b t + c t^2`. For `t` from 0 to `T`, a lower bound of `J(t)` is the smallest of its
+    Bernstein coefficients: `J`, `J + b T / 2` and `J(T)`. The last two are polynomials on the element.
+
+    `T` is cut repeatedly, until neither polynomial falls below `keep J` anywhere by more than half of `keep` times the
+    smallest `J`. For a cut, find for each polynomial the point at which it is lowest relative to `keep J`. Then reduce
+    `T` to where the polynomial reaches `keep J` there. A cut is at least 2 %, so that round-off cannot keep the loop
+    from ending.
+
+    Args:
+        determinant: of the elements.
+        start: `(m,)` the largest `t` by the quadrature points.
+        x: as for `admissible_step`.
+        dx: as for `admissible_step`.
+        params: as for `admissible_step`.
+        keep: as for `admissible_step`.
+        bound: elements whose smallest `J` is at most `bound` are ignored.
     """
     scale, of, value = _rest_stretch(params), determinant.coefficients, determinant.value
     now, step = (determinant.slopes(jnp.moveaxis(places, 0, -1)) for places in (x, dx))
     j, c = (of(slopes, slopes) / scale for slopes in (now, step))
     b = (of(now, step) + of(step, now)) / scale
-    # The axis before the elements: the two coefficients, less `keep J`.
+    # `left`: the two Bernstein coefficients minus `keep J`, on the axis before the elements.
     gap, b, c = (1 - keep) * j[:, None], jnp.stack([b / 2, b], axis=1), jnp.stack([jnp.zeros_like(c), c], axis=1)
     left = lambda t: gap + t[None, None] * (b + t[None, None] * c)
 
@@ -115,16 +129,22 @@ def _step_within(
         return jnp.any(low), jnp.where(jnp.any(low, axis=0), jnp.minimum(0.98 * t, crossing), t)
 
     start = jnp.minimum(start, 1)
-    # Most steps are short enough by the coefficients on the element alone, which are no more than what they bound.
+    # The smallest coefficient of a polynomial is a lower bound. For most steps none is negative, and no cut is needed.
     doubtful = jnp.any(left(start) < 0)
     return lax.while_loop(lambda carry: carry[0], cut, (doubtful, start))[1]
 
 
 def _first_crossing(gap: jax.Array, b: jax.Array, c: jax.Array, counts: jax.Array) -> jax.Array:
-    """The smallest `t > 0` `(m,)` at which any `gap + b t + c t^2` `(q, m)` that counts is zero; infinite if none is.
+    """The smallest `t > 0` `(m,)` at which `gap + b t + c t^2` `(q, m)` is zero at a point that counts; else infinite.
 
-    That is how `J` varies in the plane: with `b = cof F : dH` and `c = det dH`. The first of the two roots is taken in
-    the form that does not cancel.
+    In the plane `J` is quadratic along a step, with `b = cof F : dH` and `c = det dH`. The first of the two roots is
+    computed in the form without cancellation.
+
+    Args:
+        gap: `(q, m)` value at `t = 0`.
+        b: `(q, m)` coefficient of `t`.
+        c: `(q, m)` coefficient of `t^2`.
+        counts: `(q, m)` which points count.
     """
     discriminant = b**2 - 4 * c * gap
     denominator = jnp.sqrt(jnp.maximum(discriminant, 0)) - b

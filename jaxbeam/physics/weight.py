@@ -1,8 +1,8 @@
-"""Weight: a force on every piece of area, such as gravity, which keeps its size and direction.
+"""Weight: a force per area, such as gravity, which keeps its size and direction.
 
-On the nodes of an element it acts as its shape functions share it out: `f_a = force int N_a dA`. Six-node triangles
-carry it at the nodes between corners alone. Source: Zienkiewicz and Taylor, "The Finite Element Method", vol. 1, 2000,
-section 2.3.
+The shape functions `N_a` of an element distribute the force to its nodes: `f_a = force int N_a dA`. On a six-node
+triangle with straight edges, only the nodes between corners carry it. Source: Zienkiewicz and Taylor, "The Finite
+Element Method", vol. 1, 2000, section 2.3.
 """
 
 from __future__ import annotations
@@ -25,7 +25,12 @@ from jaxbeam.physics.quadrature import mapped
 
 @pytree
 class WeightParams:
-    """Of each element: rest positions `(m, k, 2)`, share of the area `(m, k)` of each node, and `force` `(m, 2)`."""
+    """Parameters of the elements.
+
+    rest: `(m, k, 2)` rest positions.
+    shares: `(m, k)` share of the rest area of each node, `int N_a dA`.
+    force: `(m, 2)` force per area at rest.
+    """
 
     rest: jax.Array
     shares: jax.Array
@@ -34,7 +39,7 @@ class WeightParams:
 
 @dataclasses.dataclass(frozen=True)
 class WeightEnergy(Energy):
-    """`- force . sum_a (int N_a dA) (x_a - X_a)`: the potential of a constant force on the area of one element."""
+    """`- force . sum_a (int N_a dA) (x_a - X_a)`: the potential of a constant force per area of one element."""
 
     name: ClassVar[str] = "weight"
     coordinates: ClassVar[int | None] = 2
@@ -51,12 +56,12 @@ class WeightEnergy(Energy):
 
 @usual_rules
 def weight(mesh: Mesh, force: Numbers) -> Term:
-    """A constant force on all area of a body, such as its density times gravity.
+    """A constant force per area on the whole body, such as its density times gravity.
 
     Args:
-        mesh: of triangles; differentiable in its nodes.
-        force: per area at rest (thickness 1), `(2,)` everywhere or `(t, 2)` on each element, such as
-            `[0, -density * 9.81]`; differentiable.
+        mesh: mesh of triangles; differentiable in its nodes.
+        force: force per area at rest (thickness 1), such as `[0, -density * 9.81]`; `(2,)`, the same everywhere, or
+            `(t, 2)`, one for each element; differentiable.
 
     Raises:
         ValueError: if `force` has another shape or is not finite, or the mesh is the line of a rod.
@@ -66,7 +71,7 @@ def weight(mesh: Mesh, force: Numbers) -> Term:
     force = checks.numbers("force", force, shapes=((2,), (count, 2)))
     xp, dtype = namespace(mesh.nodes, force), mesh.nodes.dtype
     element = element_of(mesh.elements)
-    # The shape functions times the determinant of a curved element are of degree 4.
+    # In a curved element, a shape function times the determinant is a polynomial of degree 4.
     degree = max(element.rules)
     rest, _, weights = mapped(mesh.nodes, mesh.elements, degree)
     shares = weights @ xp.asarray(element.shape(element.rule(degree)[0]), dtype)

@@ -148,9 +148,11 @@ def _prepare(ax: Axes, bounds: Limits) -> Axes:
 
 
 def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
-    """A figure of panels in `columns` columns and a row for each of `rows`, the limits of the panels in that row.
+    """A figure of equally wide panels on one scale, and their axes, row by row. Only the outer panels have labels.
 
-    Only the outer panels have labels.
+    Args:
+        columns: number of columns.
+        rows: limits of the panels of each row, from the top; the limits in x are those of all.
     """
     heights = [y1 - y0 for _, (y0, y1) in rows]
     # The padding keeps the last tick label of one panel apart from the first of the next.

@@ -54,13 +54,14 @@ def tip_position(scene: Scene, x: jax.Array) -> jax.Array:
 
 @one_program
 def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
-    """Rotation of the tip section `()` in degrees, anticlockwise: the rigid turn that fits it best.
+    """Rotation `()` of the tip section in degrees, anticlockwise: the rigid turn that fits it best.
 
-    Least squares in the plane (Kabsch 1976): `atan2(sum X x y, sum X . y)` about the centroids. Of a rod it is the
-    mean turn of the tip's nodes, which may be more than one round.
+    By least squares in the plane (Kabsch 1976) it is `atan2(sum cross(X, y), sum dot(X, y))`, with `X` the rest
+    positions of the tip nodes less their mean and `y` the present ones less theirs. It lies between -180 and 180. Of a
+    rod it is the mean turn of the tip nodes, which may exceed 360.
 
     Raises:
-        ValueError: if `x` has another shape, the scene has no tip, or a solid fewer than two tip nodes.
+        ValueError: if `x` has another shape, the scene has no tip, or the tip of a solid has fewer than two nodes.
     """
     x = placed(scene, x)
     tip = _tip(scene)

@@ -127,12 +127,18 @@ def _traced_once(name: str, energy: Callable[..., jax.Array], structure: Any, sh
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse anything but a `Scene`, and a scene in float64 while `jax_enable_x64` is off."""
+    """Check that `scene` is a `Scene`, and that float64 is switched on if its nodes are float64.
+
+    They may be float64 all the same where `jax_enable_x64` was switched off after the scene was made.
+
+    Raises:
+        ValueError: if not.
+    """
     checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
     dtype = scene.mesh.nodes.dtype
     if jax.dtypes.canonicalize_dtype(dtype) != dtype:
         raise ValueError(
-            "scene: its nodes are float64, which JAX computes with only where jax_enable_x64 is on; set "
+            "scene: its nodes are float64, which JAX computes with only while jax_enable_x64 is on; set "
             'jax.config.update("jax_enable_x64", True), or build the scene with dtype=jnp.float32'
         )
 

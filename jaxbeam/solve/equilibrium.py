@@ -111,9 +111,12 @@ def linear_response(scene: Scene, linear: LinearSolver = BlockTridiagonal()) -> 
 
 @compiled("linear")
 def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tuple[jax.Array, jax.Array, Any]:
-    """Positions `(n, d)` by linear elasticity, whether the stiffness at rest is positive definite `()`, and its factor.
+    """One Newton step from rest, where the actuated terms and the loads are out of balance.
 
-    If the stiffness is not positive definite, its factor contains NaN, and free coordinates are NaN.
+    Returns:
+        Positions `(n, d)`; whether the stiffness at rest is positive definite, a boolean `()`; and the factor of that
+        stiffness. If it is not positive definite, the factor contains NaN, and so do the free coordinates of the
+        positions. Fixed coordinates stay at rest.
     """
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))

@@ -2,15 +2,17 @@
 
 At equilibrium the unbalanced forces vanish, `g(scene, x) = 0` on the free coordinates, so
 
-    K dx = -dg        K = dg/dx, the true (unprojected) tangent stiffness.
+    K dx = -dg
 
-This takes one back-substitution with a factor of `K`. The iterations of the solver are not differentiated, and the
-derivative does not depend on where they started. Both sides of the equation are functions of the scene and of `x`, so
-JAX can differentiate them again: forward, reverse and to any order.
+where `K = dg/dx` is the true tangent stiffness, not projected to be positive definite, and `dg` is the change of `g` by
+the scene at fixed `x`. This takes one back-substitution with a factor of `K`. The iterations of the solver are not
+differentiated, and the derivative does not depend on where they started. Both sides of the equation are functions of
+the scene and of `x`, so JAX can differentiate them again: forward, reverse and to any order.
 
-The derivative exists where `K` is not singular: at every stable solution, but not at a fold. Where the status of the
-solution is not `OK` the derivative is NaN, because zero could be mistaken for an answer. A failed member of a batch
-does not affect the others as long as the loss does not depend on it (its cotangent is exactly zero).
+The derivative exists where `K` is not singular: at every stable solution, but not at a fold. A solution whose status is
+not `OK` is not `trusted`. Its derivative is NaN, because zero could be mistaken for an answer. A loss that does not
+depend on such a solution passes it a cotangent of exactly zero. For that the rule returns zero, so a failed member of a
+batch does not spoil the derivatives of the others.
 """
 
 from __future__ import annotations
@@ -63,16 +65,7 @@ def linear_gradient(scene: Scene, x: jax.Array) -> jax.Array:
 def attach_derivative(
     linear: LinearSolver, scene: Scene, layout: Layout, x: jax.Array, factor: Any, trusted: jax.Array
 ) -> jax.Array:
-    """`x` itself, with the derivative of the equilibrium attached.
-
-    Args:
-        linear: the linear solver.
-        scene: with unlocked indices; differentiable in all its floats.
-        layout: layout of the stiffness matrix.
-        x: `(n, d)` an equilibrium of the scene. A tangent of `x` itself is ignored.
-        factor: factor of the true stiffness at `x`; None to factorise it when a derivative is asked for.
-        trusted: `()` whether `x` is an equilibrium with a positive definite stiffness. If not, the derivative is NaN.
-    """
+    """`x` itself, an equilibrium of the scene, with its derivative: see `attach_derivative_of_root`."""
     return attach_derivative_of_root(linear, energy_gradient, scene, layout, x, factor, trusted)
 
 
@@ -86,18 +79,19 @@ def attach_derivative_of_root(
     factor: Any,
     trusted: jax.Array,
 ) -> jax.Array:
-    """`x` itself, with the derivative that keeps `gradient(scene, x)` zero on free coordinates.
+    """`x` itself, as the root of `gradient(scene, x) = 0` on free coordinates: its derivative keeps it a root.
 
     Args:
         linear: the linear solver.
-        gradient: `energy_gradient` or `linear_gradient`.
-        scene: as in `attach_derivative`.
-        layout: as in `attach_derivative`.
-        x: `(n, d)` positions at which the gradient is zero on free coordinates.
-        factor: factor of the derivative of `gradient` in `x`. None is allowed with `energy_gradient` only.
-        trusted: as in `attach_derivative`.
+        gradient: `energy_gradient`, or `linear_gradient` for the linear response.
+        scene: with unlocked indices; differentiable in all its floats.
+        layout: layout of the stiffness matrix.
+        x: `(n, d)` the root. A tangent of `x` itself is ignored.
+        factor: factor of `K = d gradient / dx` at `x`. With None the rule factorises the stiffness of the scene at `x`,
+            which is the `K` of `energy_gradient` alone.
+        trusted: `()` whether `x` is a root with positive definite `K`. If not, the derivative is NaN.
     """
-    return x
+    return x  # the derivative is in the rule below
 
 
 @attach_derivative_of_root.defjvp

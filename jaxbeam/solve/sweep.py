@@ -368,12 +368,15 @@ def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
 
 
 def _partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndarray]:
-    """Divide commands into groups of at most `size` neighbours, by halving along the widest coordinate until they fit.
+    """Divide commands into chunks of at most `size` neighbours.
+
+    They are sorted along the column that varies most among them and cut near the middle, again and again. Each cut is
+    at a multiple of `size`, so that all chunks but one are full.
 
     Args:
         rows: `(B, m)` commands.
         indices: indices of the commands to divide.
-        size: the most commands in a group.
+        size: the most commands in a chunk.
     """
     if len(indices) <= size:
         return [indices]

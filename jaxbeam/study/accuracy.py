@@ -151,8 +151,8 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
 def enriched(scene: Scene) -> tuple[Scene, Finer]:
     """The scene on a finer mesh, and the map of nodal fields to that mesh.
 
-    The finer mesh contains every displacement of the coarse one. Triangles of three nodes become triangles of six, and
-    triangles of six nodes are cut in four. Nodes keep their numbers, so terms that act on nodes stay as they are.
+    The finer mesh can represent every displacement of the coarse one. Triangles of three nodes become triangles of six,
+    and triangles of six nodes are cut in four. Nodes keep their numbers, so terms that act on nodes stay as they are.
 
     Raises:
         NotRefinable: a `ValueError` that names a term which cannot be refined.
@@ -160,21 +160,23 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     """
     check_scene(scene)
     if not is_concrete(*jax.tree.leaves(scene)):
-        raise ValueError("scene: expected concrete numbers to refine a mesh of, got traced ones; call outside jit")
+        raise ValueError("scene: expected concrete numbers, got traced ones; a mesh is refined outside jit")
     elements, count = scene.mesh.elements, scene.mesh.nodes.shape[0]
     if scene.mesh.radian is not None:
         raise ValueError("scene: expected a mesh of triangles to refine, got a rod, whose error is that of its model")
     finer = enriched_elements(elements, count)
     mesh = Mesh(finer.carry(np.asarray(scene.mesh.nodes)), finer.elements)
     used = finer.weights != 0
-    # A new node is fixed if it lies on the surface between fixed nodes. The same holds for nodes of the tip.
+    # A new node is fixed if it lies on the surface between fixed nodes. Inside, an edge may join two clamps, and its
+    # middle is free. The same holds for nodes of the tip. Old nodes inherit from themselves.
     outside = np.isin(np.arange(len(used)), surface(mesh))
     inherit = lambda nodes: np.all(np.asarray(nodes)[finer.nodes] | ~used, axis=1)
     new = np.arange(len(used)) >= count
     old_or_outside = outside | ~new
     fixed = np.stack([inherit(column) & old_or_outside for column in scene.fixed.T], axis=1)
     tip = np.append(scene.tip, np.flatnonzero(inherit(np.isin(np.arange(count), scene.tip)) & outside & new))
-    terms = tuple(_refined(k, term, mesh, len(finer.elements) // len(elements)) for k, term in enumerate(scene.terms))
+    parts = len(finer.elements) // len(elements)
+    terms = tuple(_refined(k, term, mesh, parts) for k, term in enumerate(scene.terms))
     return Scene(mesh, terms, fixed, tip), finer
 
 

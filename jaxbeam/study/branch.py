@@ -252,7 +252,16 @@ def _walk(
 
 
 def _branch(path: Path, points: list[Point], critical: list[Critical], ended: str) -> Branch:
-    """The record of a walk."""
+    """The points of a branch that was followed, stacked into a `Branch`, and what is measured at each of them.
+
+    Args:
+        path: the path whose equilibria they are.
+        points: at least one, in order.
+        critical: folds and bifurcations between them.
+        ended: why it ends, as in `Branch`.
+    """
+    # Of two edges that cross `crossing` gives the nodes, and -1 if none do.
+    overlaps = lambda y: crossing(path.scene, y)[0, 0] >= 0
     stack = lambda name: np.stack([np.asarray(getattr(point, name)) for point in points])
     s, x = stack("s"), stack("x")
     return Branch(
@@ -262,7 +271,7 @@ def _branch(path: Path, points: list[Point], critical: list[Critical], ended: st
         negative=stack("negative"),
         residual=stack("residual"),
         smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(path.scene, y))(jnp.asarray(x))),
-        overlapping=np.asarray(lax.map(lambda y: crossing(path.scene, y)[0, 0] >= 0, jnp.asarray(x))),
+        overlapping=np.asarray(lax.map(overlaps, jnp.asarray(x))),
         critical=tuple(critical),
         ended=ended,
     )
