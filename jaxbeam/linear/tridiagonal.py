@@ -78,8 +78,8 @@ class BlockTridiagonal:
         (pivot, beside), corner = _eliminate_blocks(layout, storage, eliminate)
         r = len(corner)
         corner = jnp.linalg.cholesky(corner, symmetrize_input=False) if r else corner
-        # A block that fails is NaN. The NaN spreads to the blocks after it and to the border, unless no block is coupled
-        # to another.
+        # A block that fails is NaN. The NaN spreads to the blocks after it and to the border, unless no two blocks are
+        # coupled.
         last = corner[None] if r else pivot[-1:] if layout.blocks[2] else pivot
         ok = jnp.all(jnp.isfinite(last[:, -1, -1]))
         return BorderedFactor(pivot, beside, corner), ok
