@@ -183,9 +183,8 @@ def _contraction(density: Callable[[jax.Array, Any], jax.Array], e: jax.Array, m
     zero = jnp.zeros_like(e)
     by_e, by_q = jax.grad(force, argnums=(0, 1))(zero, zero, material)
     small = by_e / by_q * e
-    # The start is right at small strain. If Poisson's ratio is not negative, it has `1 + q > 0` at any stretch, as a
-    # logarithmic density needs.
-    start = jnp.where(e < 0, -small, -small / (1 + jnp.where(e < 0, 0, small)))
+    # The start is right at small strain, and has `1 + q > 0` at any stretch, as a logarithmic density needs.
+    start = jnp.where(small < 0, -small, -small / (1 + jnp.maximum(small, 0)))
 
     def improve(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         count, q, _ = carry

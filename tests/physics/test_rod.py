@@ -74,6 +74,20 @@ def test_fibre_is_free_to_contract(density, stretch):
     np.testing.assert_allclose(stress, MATERIALS[density](H + np.eye(2), MU, LAM)[0, 0], atol=1e-13 * LAM)
 
 
+@pytest.mark.parametrize("poisson", [-0.5, -0.3, 0.0, 0.45])
+def test_fibre_of_any_stretch_and_poisson_ratio(poisson):
+    """Against a search for the least energy. At a negative ratio a pulled fibre widens, and one that is compressed much
+    has no least energy: the density falls without end as `J` goes to 0."""
+    lame = jb.lame(1.0, poisson)
+    mu, lam = float(lame.mu), float(lame.lam)
+    stretches = np.array([0.05, 0.3, 0.9, 1.5, 4.0, 6.0])[0 if poisson >= 0 else 2 :]
+    of = lambda a, b: mu / 2 * (a**2 + b**2 - 2) - mu * np.log(a * b) + lam / 2 * np.log(a * b) ** 2
+    least = [of(a, np.geomspace(0.1, 20, 200_001)).min() for a in stretches]
+    params = jb.Lame(jnp.asarray(mu), jnp.asarray(lam))
+    energy = jax.jit(jax.vmap(lambda e: fibre_energy(jb.neo_hookean, e, params)))
+    np.testing.assert_allclose(energy(jnp.asarray(stretches - 1)), least, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_fibre_differentiates_to_third_order_and_in_the_material():
     """Against the same law with the contraction `(lam + mu) a / (mu + lam a^2)` put in."""
