@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +18,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import Numbers, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.scene.overlap import crossing
@@ -102,13 +101,13 @@ class Point(NamedTuple):
     corrections: `()` corrections taken to get there.
     """
 
-    x: jax.Array
-    s: jax.Array
-    dx: jax.Array
-    ds: jax.Array
-    negative: jax.Array
-    residual: jax.Array
-    corrections: jax.Array
+    x: Any
+    s: Any
+    dx: Any
+    ds: Any
+    negative: Any
+    residual: Any
+    corrections: Any
 
 
 @usual_rules
@@ -154,10 +153,11 @@ def trace_branch(
     checks.count("max_points", max_points, 1)
     dtype = scene.mesh.nodes.dtype
     command(scene, ratios)  # checks the ratios
-    path = Path(scene, jnp.asarray(ratios, dtype), solver.linear.layout(topology(scene)), solver)
-    x = _first_state(path, parameter, x0)
-    zero = jnp.zeros_like(x)
-    here = Point(x, jnp.asarray(parameter, dtype), zero, jnp.asarray(direction, dtype), *3 * [jnp.zeros((), int)])
+    path = Path(scene, np.asarray(ratios, dtype), solver.linear.layout(topology(scene)), solver)
+    x = np.asarray(_first_state(path, parameter, x0))
+    # Of the dtypes that `_advance` returns, so that it is compiled once.
+    count, residual = np.zeros((), np.int32), np.zeros((), dtype)
+    here = Point(x, dtype.type(parameter), np.zeros_like(x), dtype.type(direction), count, residual, count)
     points, critical, ended = _walk(path, path.advance(here, 0.0), interval, step, max_points, progress)
     return _branch(path, points, critical, ended)
 
@@ -177,7 +177,7 @@ def _check_way(
     return (low, high), parameter, step
 
 
-def on_the_way(scene: Scene, end: jax.Array, s: Any) -> Any:
+def on_the_way(scene: Scene, end: Any, s: Any) -> Any:
     """The commands `rest + s (end - rest)`."""
     rest = rest_commands(scene)
     return rest + s * (end - rest)
@@ -193,7 +193,7 @@ class Path(NamedTuple):
     """
 
     scene: Scene
-    end: jax.Array
+    end: np.ndarray
     layout: Layout
     solver: Newton
 
@@ -206,8 +206,8 @@ class Path(NamedTuple):
 
     def advance(self, here: Point, length: float) -> Point:
         """The point of the branch at arclength `length` along the tangent of `here`."""
-        arclength = jnp.asarray(length, here.s.dtype)
-        return _advance(unlock(self.scene), self.layout, self.end, here, arclength, solver=self.solver)
+        arclength = here.s.dtype.type(length)
+        return jax.device_get(_advance(unlock(self.scene), self.layout, self.end, here, arclength, self.solver))
 
 
 def _first_state(path: Path, parameter: float, x0: Numbers | None) -> jax.Array:
@@ -260,21 +260,27 @@ def _branch(path: Path, points: list[Point], critical: list[Critical], ended: st
         critical: folds and bifurcations between them.
         ended: why it ends, as in `Branch`.
     """
-    # Of two edges that cross `crossing` gives the nodes, and -1 if none do.
-    overlaps = lambda y: crossing(path.scene, y)[0, 0] >= 0
-    stack = lambda name: np.stack([np.asarray(getattr(point, name)) for point in points])
+    stack = lambda name: np.stack([getattr(point, name) for point in points])
     s, x = stack("s"), stack("x")
+    smallest, overlapping = jax.device_get(_looked_at(path.scene, x))
     return Branch(
         parameter=s,
         ratios=np.asarray(path.commands_at(s[:, None])),
         x=x,
         negative=stack("negative"),
         residual=stack("residual"),
-        smallest_jacobian=np.asarray(jax.vmap(lambda y: smallest_jacobian(path.scene, y))(jnp.asarray(x))),
-        overlapping=np.asarray(lax.map(overlaps, jnp.asarray(x))),
+        smallest_jacobian=smallest,
+        overlapping=overlapping,
         critical=tuple(critical),
         ended=ended,
     )
+
+
+@jax.jit
+def _looked_at(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The smallest `J`, and whether the body passes through itself, at each of the positions `(P, n, d)`."""
+    # Of two edges that cross `crossing` gives the nodes, and -1 if none do.
+    return lax.map(lambda y: (smallest_jacobian(scene, y), crossing(scene, y)[0, 0] >= 0), x)
 
 
 # Largest distance of a new point from its prediction, over the length of the step, and least cosine of the angle
@@ -286,12 +292,12 @@ MIN_COSINE = 0.9
 def _strays(old: Point, new: Point, length: float, size: float) -> bool:
     """Whether the new point lies so far from the old tangent that it may be on another branch."""
     weight = 1 / (new.x.size * size**2)
-    offset = weight * jnp.sum((new.x - old.x - length * old.dx) ** 2) + (new.s - old.s - length * old.ds) ** 2
-    cosine = weight * jnp.sum(new.dx * old.dx) + new.ds * old.ds
-    return bool((jnp.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
+    offset = weight * np.sum((new.x - old.x - length * old.dx) ** 2) + (new.s - old.s - length * old.ds) ** 2
+    cosine = weight * np.sum(new.dx * old.dx) + new.ds * old.ds
+    return bool((np.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
 
 
-@partial(jax.jit, static_argnames="solver")
+@compiled("solver")
 def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: jax.Array, solver: Newton) -> Point:
     """The point of the branch at arclength `length` along the tangent of `here`."""
     rtol = solver.tolerance(here.x.dtype)
@@ -378,4 +384,4 @@ def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Cr
             side = -1
     ratios = np.asarray(path.commands_at(point.s))
     kind = "fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation"
-    return Critical(kind, float(point.s), ratios, point.x, shape, value, after)
+    return Critical(kind, float(point.s), ratios, jnp.asarray(point.x), shape, value, after)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
@@ -20,6 +19,10 @@ from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver
 from jaxbeam.solve.solution import Solution
 from jaxbeam.study.design import Design, DesignStatus, History
+
+# optax takes as long to import as all of jaxbeam, so only `minimise` imports it.
+if TYPE_CHECKING:
+    import optax
 
 # --------------------------------------------------------------------------------------------- minimise
 
@@ -118,6 +121,7 @@ class Programs(NamedTuple):
 
 def _programs(loss: Any, design: Any, optimiser: optax.GradientTransformation, solver: Newton) -> Programs:
     """The functions that `minimise` calls in its loop."""
+    import optax
 
     def objective(theta: Any, x: jax.Array) -> tuple[jax.Array, Solution]:
         scene = design(theta)
@@ -177,6 +181,8 @@ def _descend(
     progress: Callable[[int, float], None] | None,
 ) -> None:
     """Take steps until the loss is at the goal or stationary, no steps are left, or too many trials fail in a row."""
+    from optax import tree_utils
+
     for count in range(steps + 1):
         (value, solution), grad = programs.evaluate(state.theta, state.x)
         slope = max(float(np.max(np.abs(leaf))) for leaf in jax.tree.leaves(grad))
@@ -199,7 +205,7 @@ def _descend(
             return
         if count < steps:
             state.theta, state.optimiser = programs.advance(state.theta, state.optimiser, grad, value, state.x)
-            state.solves += int(optax.tree_utils.tree_get(state.optimiser, "num_linesearch_steps", default=0))
+            state.solves += int(tree_utils.tree_get(state.optimiser, "num_linesearch_steps", default=0))
 
 
 def _record(state: DescentState, solution: Solution, loss: float, slope: float) -> bool:
