@@ -35,34 +35,34 @@ def minimiser(c: Any) -> Any:
     smoothly with the coefficients.
     """
     xp = array_module(c)
-    value = lambda place: (c * basis(place)).sum(axis=0)
-    candidates = [_on_edge(c, 3 + k, a, b) for k, (a, b) in enumerate(EDGES)] + [_inside(c)]
-    best, least = candidates[0], value(candidates[0])
-    for place in candidates[1:]:
-        here = value(place)
-        lower = here < least
-        best, least = xp.where(lower[None], place, best), xp.where(lower, here, least)
-    return best
+    along, least = _on_edges(c)
+    place, inside = _inside(c)
+    lower = inside & ((c * basis(place)).sum(axis=0) < least)
+    return xp.where(lower[None], place, along)
 
 
-def _on_edge(c: Any, edge: int, a: int, b: int) -> Any:
-    """The point between corners `a` and `b` at which the polynomial is smallest on their edge.
-
-    Corner `a` if the polynomial is smallest at an end of the edge.
-    """
+def _on_edges(c: Any) -> tuple[Any, Any]:
+    """The point `(3, ...)` of the three edges at which the polynomial is smallest, and its value `(...)` there."""
     xp = array_module(c)
-    at_a, at_b = c[a] - c[edge], c[b] - c[edge]
-    between = (at_a > 0) & (at_b > 0)
-    share = xp.where(between, at_a / xp.where(between, at_a + at_b, 1), 0)
-    place = [xp.zeros_like(share)] * 3
-    place[a], place[b] = 1 - share, share
-    return xp.stack(place)
+    # Of each edge: the coefficients of its first corner, of the edge itself and of its second corner.
+    first, middle, second = c[:3], c[3:], xp.concatenate([c[1:3], c[:1]])
+    fall, rise = first - middle, second - middle
+    between = (fall > 0) & (rise > 0)
+    # Share of the edge from its first corner to the point; 0 if the polynomial is smallest at an end of the edge.
+    share = xp.where(between, fall / xp.where(between, fall + rise, 1), 0)
+    values = first * (1 - share) ** 2 + 2 * middle * share * (1 - share) + second * share**2
+    number = xp.arange(3).reshape(3, *[1] * (c.ndim - 1))
+    best = number == xp.argmin(values, axis=0)[None]
+    share = xp.where(best, share, 0).sum(axis=0)[None]
+    after = xp.concatenate([best[2:], best[:2]])
+    return xp.where(best, 1 - share, xp.where(after, share, 0)), values.min(axis=0)
 
 
-def _inside(c: Any) -> Any:
-    """The stationary point of the polynomial; corner 0 if that point is outside the triangle or not a minimum.
+def _inside(c: Any) -> tuple[Any, Any]:
+    """The stationary point `(3, ...)` of the polynomial, and whether it is a minimum inside the triangle `(...)`.
 
-    With `y = (l1, l2)` the polynomial is `c0 + 2 g y + y D y`. Cramer's rule solves `D y = -g`.
+    With `y = (l1, l2)` the polynomial is `c0 + 2 g y + y D y`. Cramer's rule solves `D y = -g`. Where there is no such
+    minimum the point is corner 0.
     """
     xp = array_module(c)
     g1, g2, rise = c[3] - c[0], c[5] - c[0], c[4] - c[3]
@@ -71,4 +71,4 @@ def _inside(c: Any) -> Any:
     y1, y2 = d12 * g2 - d22 * g1, d12 * g1 - d11 * g2
     inside = (determinant > 0) & (d11 > 0) & (y1 > 0) & (y2 > 0) & (y1 + y2 < determinant)
     y1, y2 = (xp.where(inside, y / xp.where(inside, determinant, 1), 0) for y in (y1, y2))
-    return xp.stack([1 - y1 - y2, y1, y2])
+    return xp.stack([1 - y1 - y2, y1, y2]), inside

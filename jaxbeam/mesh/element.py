@@ -145,9 +145,9 @@ def least_ratio(determinant: Determinant, p: jax.Array, q: jax.Array) -> jax.Arr
         place = determinant.minimiser(p - ratio[None] * q)
         return determinant.value(p, place) / determinant.value(q, place)
 
-    ratio = step(1, step(0, jnp.zeros_like(p[0])))
     varies = jnp.any(jnp.ptp(q, axis=0) > jnp.finfo(q.dtype).eps ** 0.5 * q[0])
-    return lax.cond(varies, lambda ratio: lax.fori_loop(0, FURTHER, step, ratio), lambda ratio: ratio, ratio)
+    # One loop for all steps: written out they take most of the time of compiling a solve.
+    return lax.fori_loop(0, jnp.where(varies, 2 + FURTHER, 2), step, jnp.zeros_like(p[0]))
 
 
 @least_ratio.defjvp
