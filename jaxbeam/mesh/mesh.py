@@ -59,6 +59,11 @@ class Mesh:
         object.__setattr__(self, "nodes", to_device(nodes))
         object.__setattr__(self, "elements", elements)
 
+    @property
+    def is_line(self) -> bool:
+        """Whether it is the centre line of a rod (see `jaxbeam.mesh.line.Line`) instead of triangles."""
+        return self.radian is not None
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.summary()})"
 
@@ -67,7 +72,7 @@ class Mesh:
         if not all(hasattr(each, "shape") for each in (self.nodes, self.elements)):
             return "a tree of other values"
         count, nodes = self.elements.shape
-        kind = element_of(self.elements).name if self.radian is None else "element"
+        kind = element_of(self.elements).name if not self.is_line else "element"
         return f"{len(self.nodes)} nodes, {count} {kind}s of {nodes} nodes, {self.nodes.dtype}"
 
 
@@ -143,7 +148,7 @@ def _concrete_nodes(mesh: Mesh) -> np.ndarray:
 def check_triangles(mesh: Mesh) -> None:
     """Raise `ValueError` if `mesh` is not a mesh of triangles."""
     checks.instance("mesh", mesh, Mesh, "make one with rectangle(length, height, nx, ny) or Mesh(nodes, elements)")
-    if mesh.radian is not None:
+    if mesh.is_line:
         raise ValueError("mesh: expected triangles, got the Line of a rod, whose body is rod(line, height, params)")
 
 

@@ -72,7 +72,7 @@ class _Beam:
     def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
         self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
         self.patches, self.shares, pulling = patches(scene)
-        self.rod, self.names = scene.mesh.radian is not None, line_names(scene)
+        self.rod, self.names = scene.mesh.is_line, line_names(scene)
         rest = np.asarray(scene.mesh.nodes)
         dotted = {"colors": GHOST, "linewidths": 0.9, "linestyles": "dotted"}
         ghost = LineCollection(list(edge_curves(rest, self.edges)), label="at rest", zorder=1, **dotted)

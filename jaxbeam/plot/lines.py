@@ -29,7 +29,7 @@ def elements_of(scene: Scene) -> np.ndarray:
 
 def outline(scene: Scene) -> np.ndarray:
     """The edges `(e, 2)` or `(e, 3)` of the surface, the body on their left; of a rod, those of its centre line."""
-    return surface(scene.mesh) if scene.mesh.radian is None else np.asarray(scene.mesh.elements)
+    return surface(scene.mesh) if not scene.mesh.is_line else np.asarray(scene.mesh.elements)
 
 
 def edge_curves(x: np.ndarray, edges: np.ndarray, shares: Numbers = 1.0) -> np.ndarray:

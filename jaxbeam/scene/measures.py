@@ -65,7 +65,7 @@ def section_rotation(scene: Scene, x: jax.Array) -> jax.Array:
     """
     x = placed(scene, x)
     tip = _tip(scene)
-    if scene.mesh.radian is not None:
+    if scene.mesh.is_line:
         return jnp.rad2deg(jnp.mean((x - scene.mesh.nodes)[tip, 2]) / scene.mesh.radian)
     if tip.shape[0] < 2:
         raise ValueError(f"scene: expected at least two tip nodes to measure a rotation, got {tip.shape[0]}")

@@ -118,7 +118,7 @@ def _rigid_motions(scene: Scene) -> Rigid:
     node = np.arange(len(whole))
     slope[node, 0, piece, 0] = slope[node, 1, piece, 1] = 1
     slope[node, :2, piece, 2] = arms[:, ::-1] * [-1, 1] / size[:, None]
-    if scene.mesh.radian is not None:
+    if scene.mesh.is_line:
         # The third coordinate is an angle times `radian`. It is linear in the rotation and has no second derivative.
         slope[node, 2, piece, 2] = float(scene.mesh.radian) / size
     bend[:, :2] = -arms / size[:, None] ** 2

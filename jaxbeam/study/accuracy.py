@@ -162,7 +162,7 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     if not is_concrete(*jax.tree.leaves(scene)):
         raise ValueError("scene: expected concrete numbers, got traced ones; a mesh is refined outside jit")
     elements, count = scene.mesh.elements, scene.mesh.nodes.shape[0]
-    if scene.mesh.radian is not None:
+    if scene.mesh.is_line:
         raise ValueError("scene: expected a mesh of triangles to refine, got a rod, whose error is that of its model")
     finer = enriched_elements(elements, count)
     mesh = Mesh(finer.carry(np.asarray(scene.mesh.nodes)), finer.elements)
