@@ -105,9 +105,9 @@ class _Beam:
 
 
 def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
-    """Which of the lines push, `(m,)`.
+    """Whether each of the drawn lines, such as tendons, is in compression, `(m,)`.
 
-    Positions are enlarged by 1e-5, so that a line at its commanded length does not push by round-off.
+    Positions are scaled by 1 + 1e-5, so that round-off does not make a line at its commanded length look compressed.
     """
     x, found = x.at[:, :2].multiply(1 + 1e-5), []
     for term, lines in drawn_terms(scene):

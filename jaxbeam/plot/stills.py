@@ -177,13 +177,13 @@ def branches(
     *,
     ax: Axes | None = None,
 ) -> Axes:
-    """A measure along branches of equilibria. Stable parts are full lines, unstable ones dashed.
+    """A measure of branches of equilibria against actuation. Stable parts are full lines, unstable ones dashed.
 
-    Folds and bifurcations are marked.
+    A circle marks a fold, and a diamond a bifurcation.
 
     Args:
-        scene: the scene that was traced.
-        traced: branches from `trace_branch`; each has a colour of its own.
+        scene: the scene whose branches were traced.
+        traced: branches from `trace_branch`, each in the next colour.
         measure: `(scene, x)` to a scalar.
         label: text of the vertical axis: quantity and unit.
         ax: where to draw; by default a new figure.
@@ -198,7 +198,7 @@ def branches(
     shown = {}
     for number, branch in enumerate(traced):
         colour, critical = PALETTE[number % len(PALETTE)], branch.critical
-        # Critical points go between their neighbours: there a line changes from full to dashed.
+        # Each critical point goes between its neighbours and counts as stable: the line changes its style there.
         order = np.argsort([*range(len(branch.x)), *(each.after + 0.5 for each in critical)])
         commands = np.concatenate([branch.ratios, *(each.ratios[None] for each in critical)])
         x = np.concatenate([branch.x, *(np.asarray(each.x)[None] for each in critical)])
@@ -207,6 +207,8 @@ def branches(
         negative = np.append(branch.negative, np.zeros(len(critical), int))[order]
         stable = np.maximum(negative[:-1], negative[1:]) == 0
         for run in np.split(np.arange(stable.size), np.flatnonzero(np.diff(stable)) + 1):
+            if not run.size:  # a branch of one point has no line
+                continue
             points = order[[*run, run[-1] + 1]]
             name = "stable" if stable[run[0]] else "unstable"
             style: Any = "-" if stable[run[0]] else UNSTABLE

@@ -4,7 +4,8 @@ The path has a parameter `s`; an equilibrium is asked for at each of a few targe
 one target. The compiled program has a single Newton loop, which all solves share.
 
 An *attempt* is one Newton solve from a predicted start. Its state is *accepted* if it converged, unless it is a saddle
-or the increment may have been too long (see `_judge`). After a failed attempt the increment is halved.
+or the increment may have been too long (see `_judge`). A failed attempt halves the increment, and an
+accepted one doubles it.
 """
 
 from __future__ import annotations
@@ -37,15 +38,12 @@ ATTEMPT_STEPS = 60
 # has a curved valley, along which a line search advances very slowly.
 FULL_STEPS = 8
 
-# Failed attempts at a target before it is given up.
+# Failed attempts, since a target was last reached with status `OK`, before a target is given up.
 MAX_CUTS = 20
-
 # Consecutive saddles that are left before one is accepted.
 MAX_ESCAPES = 4
-
 # Largest component of the displacement away from a saddle, over the size of the body.
 ESCAPE = 1e-3
-
 # The most attempts at one target, however few steps they take.
 MAX_ATTEMPTS = 100
 
@@ -347,17 +345,21 @@ def _extend(state: Continuation, attempt: newton.State, verdict: Verdict) -> Tra
 def _next_parameter(
     problem: Problem, state: Continuation, verdict: Verdict, report: Report, trail: Trail
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The index of the next target, the parameter of the next attempt, and the increment; each `()`."""
-    cut = jnp.where(verdict.saddle, state.increment, 0.5 * (state.parameter - trail.s[0]))
-    # If the first attempt reached the target, the first attempt at the next target goes straight there too.
-    easy = verdict.landed & ((report.attempts == 1) | (state.increment <= 0))
-    increment = jnp.where(easy, 1.0, jnp.where(verdict.accepted, 2 * state.increment, cut)).astype(trail.x.dtype)
+    """The index of the next target, the parameter of the next attempt, and the increment; each `()`.
+
+    An accepted attempt doubles the increment. A failed one leaves half the distance that it tried from the newest state
+    of `trail`. From a saddle the same parameter is tried again.
+    """
+    shorter = jnp.where(verdict.saddle, state.increment, 0.5 * (state.parameter - trail.s[0]))
+    # If one attempt reached the target, the next target is tried in one attempt: the whole path has length 1.
+    in_one = verdict.landed & ((report.attempts == 1) | (state.increment <= 0))
+    increment = jnp.where(in_one, 1.0, jnp.where(verdict.accepted, 2 * state.increment, shorter)).astype(trail.x.dtype)
     target = jnp.minimum(state.target + verdict.landed.astype(jnp.int32), len(problem.targets) - 1)
     # Do not stop just short of the target: the increment left would be almost zero.
     to_target = verdict.give_up | (trail.s[0] + 1.01 * increment >= problem.targets[target])
     parameter = jnp.where(to_target, problem.targets[target], trail.s[0] + increment)
-    leave = verdict.saddle & ~verdict.give_up
-    return target, jnp.where(leave, state.parameter, parameter), increment
+    escaping = verdict.saddle & ~verdict.give_up
+    return target, jnp.where(escaping, state.parameter, parameter), increment
 
 
 def _next_start(
@@ -370,12 +372,12 @@ def _next_start(
     parameter: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Positions `(n, d)` that the next attempt, at `parameter`, starts from, and the displacement added to them."""
-    leave = verdict.saddle & ~verdict.give_up
-    start = jnp.where(leave, attempt.x, jnp.where(verdict.give_up, accepted, trail.x[0]))
+    escaping = verdict.saddle & ~verdict.give_up
+    start = jnp.where(escaping, attempt.x, jnp.where(verdict.give_up, accepted, trail.x[0]))
     scale = ESCAPE * extent(scene) / jnp.max(jnp.abs(attempt.response))
     escape = jnp.where(jnp.isfinite(scale), scale * attempt.response, 0)
     predicted = jnp.where(verdict.give_up, 0, predict(trail, parameter))
-    return start, jnp.where(leave, escape, predicted)
+    return start, jnp.where(escaping, escape, predicted)
 
 
 def _write(state: Continuation, report: Report, final: jax.Array) -> PackedReport:

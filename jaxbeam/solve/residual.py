@@ -29,7 +29,9 @@ def force_scale(scene: Scene, evaluation: Evaluation) -> jax.Array:
 
 
 def row_magnitudes(scene: Scene, hessians: list[jax.Array]) -> jax.Array:
-    """Sum of magnitudes in each row of the stiffness, `(n, d)`, added up stencil by stencil.
+    """For each coordinate, the sum of the magnitudes of the entries in its row of every stencil Hessian, `(n, d)`.
+
+    It is at least the sum over the row of the assembled stiffness, where entries of several stencils may cancel.
 
     Args:
         scene: the scene to whose terms the Hessians belong.
@@ -38,7 +40,7 @@ def row_magnitudes(scene: Scene, hessians: list[jax.Array]) -> jax.Array:
     n, d = scene.mesh.nodes.shape
     total = jnp.zeros((n, d), scene.mesh.nodes.dtype)
     for term, hessian in zip(scene.terms, hessians, strict=True):
-        # Written as single additions: for `jnp.sum` XLA calls a library, and the call takes longer than the additions.
+        # Written as single additions, which take less time than the library call that XLA makes of `jnp.sum`.
         rows = functools.reduce(jnp.add, jnp.abs(hessian.swapaxes(0, 1))).reshape(-1, d, hessian.shape[-1])
         total = total.at[term.nodes].add(jnp.moveaxis(rows, -1, 0))
     return total

@@ -219,7 +219,8 @@ def _entered(chunk: Chunk, index: jax.Array, parent: jax.Array, found: Continued
 def _continue(
     scene: Scene, layout: Layout, chunk: Chunk, index: jax.Array, parent: jax.Array, solver: Newton
 ) -> Continued:
-    """The equilibrium of the command `index` `()`, continued from the entry `parent` `()`."""
+    """The equilibrium of the command `index` `()`, continued from the solved entry `parent` `()` of the chunk, and its
+    derivative in the ratios, from which later commands are predicted."""
     ratios, start = chunk.ratios[index], chunk.ratios[parent]
     loaded = lambda s: (1 - s) * chunk.loaded[parent] + s
     scene_at = lambda s: command(partway(scene, loaded(s)), (1 - s) * start + s * ratios)
@@ -228,6 +229,7 @@ def _continue(
     path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=predict(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
     gradient = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
+    # `dx/dr = -K^-1 dg/dr`, one column for each ratio.
     load = lambda direction: gather(layout, jax.jvp(gradient, (ratios,), (direction,))[1])
     loads = jax.vmap(load, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
     moves = solver.linear.solve(layout, factor, loads)

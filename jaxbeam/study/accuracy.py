@@ -189,7 +189,10 @@ def _refined(number: int, term: Term, mesh: Mesh, parts: int) -> Term:
 
 
 def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton) -> tuple[ErrorEstimate, Scene, Any]:
-    """The estimate, the finer scene, and the positions at which the solution of the finer scene is expected."""
+    """The estimate, the finer scene, and the positions at which its equilibrium is expected.
+
+    Without a finer scene, the bar is infinite, and the given scene and positions are returned.
+    """
     if (shape := jax.eval_shape(measure, scene, solution.x).shape) != ():
         raise ValueError(f"measure: expected a function that returns a scalar, got shape {shape}")
     own = _change(scene, solution.x, measure, solver)
@@ -207,7 +210,7 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
             break
         factor = step.factor if step.length < near else None
         near, step = min(near, SHRINKING * step.length), _change(finer, step.x, measure, solver, factor=factor)
-        # Compare values: a measure such as the mean over the tip may weigh nodes differently on the finer mesh.
+        # The value before the step differs from `value` too: a mean over the tip weighs other nodes on the finer mesh.
         change = step.value - value + step.total
     moved = step.x
     if not np.isfinite(change):

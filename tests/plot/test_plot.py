@@ -585,3 +585,12 @@ def test_errors_name_the_argument(scene, states):
         plot.gallery(states, ["one"])
     with pytest.raises(ValueError, match="columns: expected at least 1, got 0"):
         plot.gallery(states, columns=0)
+
+
+def test_a_branch_of_one_point_is_drawn():
+    """It has no line, and does not stop others from being drawn."""
+    scene = jb.tendon_beam(5, 3)
+    short = jb.trace_branch(scene, [0.8, 1.0], max_points=1)
+    longer = jb.trace_branch(scene, [0.8, 1.0], step=0.5)
+    ax = plot.branches(scene, [short, longer])
+    assert len(ax.lines) == 1
