@@ -16,6 +16,8 @@ from jaxbeam.mesh.rectangle import rectangle as rectangle
 from jaxbeam.mesh.refinement import quadratic as quadratic
 from jaxbeam.mesh.refinement import refined as refined
 from jaxbeam.physics.cable import cables as cables
+from jaxbeam.physics.distributed_load import traction as traction
+from jaxbeam.physics.distributed_load import weight as weight
 from jaxbeam.physics.energy import Energy as Energy
 from jaxbeam.physics.energy import NotRefinable as NotRefinable
 from jaxbeam.physics.energy import Term as Term
@@ -34,7 +36,6 @@ from jaxbeam.physics.tendon import constant_stiffness as constant_stiffness
 from jaxbeam.physics.tendon import inverse_square_stiffness as inverse_square_stiffness
 from jaxbeam.physics.tendon import inverse_stiffness as inverse_stiffness
 from jaxbeam.physics.tendon import tendons as tendons
-from jaxbeam.physics.weight import weight as weight
 from jaxbeam.scene.beams import rod_beam as rod_beam
 from jaxbeam.scene.beams import tendon_beam as tendon_beam
 from jaxbeam.scene.measures import cauchy_stress as cauchy_stress

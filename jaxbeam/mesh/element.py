@@ -172,6 +172,13 @@ def edge_functions(nodes: int, xi: np.ndarray) -> np.ndarray:
     return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=-1)
 
 
+def edge_slopes(nodes: int, xi: np.ndarray) -> np.ndarray:
+    """Slopes `(..., nodes)` of the `edge_functions` in `xi`."""
+    if nodes == 2:
+        return np.stack([np.full_like(xi, -1.0), np.full_like(xi, 1.0)], axis=-1)
+    return np.stack([4 * xi - 3, 4 * xi - 1, 4 - 8 * xi], axis=-1)
+
+
 def edge_products(nodes: int) -> np.ndarray:
     """Integrals `(nodes, nodes)` along an edge, `int N_a (dN_b/dxi) dxi`, of its shape functions `N`."""
     if nodes == 2:

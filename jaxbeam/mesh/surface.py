@@ -100,3 +100,36 @@ def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
     low, high = np.sort(every[:, :2].astype(np.int64), axis=1).T
     _, number, count = np.unique(low * (triangles.max() + 1) + high, return_inverse=True, return_counts=True)
     return read_only(every[count[number] == 1])
+
+
+def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
+    """The edges `(m, k)` of the surface of which both corners are among `nodes`.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    edges = surface(mesh)
+    chosen = edges[np.isin(edges[:, :2], nodes).all(axis=1)]
+    if not len(chosen):
+        raise ValueError(
+            f"nodes: expected the corners of at least one edge of the surface, got {nodes.tolist()}; "
+            f"choose them with nodes_where(mesh, ...)"
+        )
+    return chosen
+
+
+def finer_edges(mesh: Mesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of the surface of a finer mesh that lie on `edges` `(m, k)` of a coarser one.
+
+    Returns:
+        The edges, in order; and for each the index of the coarse edge on which it lies.
+    """
+    following = {line[0]: line for line in surface(mesh).tolist()}
+    found, parents = [], []
+    for parent, (start, end) in enumerate(edges[:, :2].tolist()):
+        here = start
+        while here != end:
+            found.append(following[here])
+            parents.append(parent)
+            here = following[here][1]
+    return np.array(found), np.array(parents)

@@ -24,7 +24,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.element import edge_products
 from jaxbeam.mesh.mesh import Mesh
-from jaxbeam.mesh.surface import surface
+from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 
@@ -85,16 +85,10 @@ class PressureEnergy(Energy):
         )
 
     def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
-        following = {line[0]: line for line in surface(mesh).tolist()}
-        edges = []
-        for start, end in term.nodes[:, :2].tolist():
-            here = start
-            while here != end:
-                edges.append(following[here])
-                here = following[here][1]
+        edges, _ = finer_edges(mesh, term.nodes)
         count = len(edges)
         centre = jnp.broadcast_to(term.params.centre[0], (count, 2))
-        return Term(self, np.array(edges), PressureParams(jnp.broadcast_to(term.params.pressure[0], (count,)), centre))
+        return Term(self, edges, PressureParams(jnp.broadcast_to(term.params.pressure[0], (count,)), centre))
 
 
 @usual_rules
@@ -114,13 +108,7 @@ def pressure(mesh: Mesh, nodes: Numbers, value: Numbers = 0.0) -> Term:
     """
     chosen = check_nodes("nodes", mesh, nodes, ndim=1)
     value = checks.number("value", value)
-    edges = surface(mesh)
-    edges = edges[np.isin(edges[:, :2], chosen).all(axis=1)]
-    if not len(edges):
-        raise ValueError(
-            f"nodes: expected the corners of at least one edge of the surface, got {chosen.tolist()}; "
-            f"choose them with nodes_where(mesh, ...)"
-        )
+    edges = edges_between(mesh, chosen)
     dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
     xp = namespace(rest, value)
     centre = xp.broadcast_to(rest[edges[:, 0]].mean(axis=0), (len(edges), 2))

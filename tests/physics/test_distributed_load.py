@@ -1,4 +1,4 @@
-"""Weight against closed forms and against integrals of random fields."""
+"""Weight and traction against closed forms and against integrals of random fields."""
 
 import jax
 import jax.numpy as jnp
@@ -116,3 +116,46 @@ def test_bad_weights_are_refused():
         jb.weight(mesh, [0.0, np.nan])
     with pytest.raises(ValueError, match="expected triangles, got the Line of a rod"):
         jb.weight(jb.rod_beam(5).mesh, [0.0, -1.0])
+
+
+# ------------------------------------------------------------------------------------------------ traction
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_traction_does_the_work_of_its_force(order):
+    """`sum f . u = force . int u ds` along the curved upper side, the integral by many short chords."""
+    mesh = curved(order)
+    upper = jb.nodes_where(jb.rectangle(2.0, 1.0, 5, 3, "crossed", order=order), lambda x, y: y > 0.49)
+    term = jb.traction(mesh, upper, FORCE)
+    u = np.random.default_rng(1).normal(size=mesh.nodes.shape)
+    xi = np.linspace(0, 1, 4001)
+    if order == 1:
+        shape = np.stack([1 - xi, xi], axis=1)
+    else:
+        shape = np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=1)
+    assert len(term.nodes) == 4
+    work = 0.0
+    for edge in term.nodes:
+        x, moved = shape @ np.asarray(mesh.nodes)[edge], shape @ u[edge]
+        work += np.linalg.norm(np.diff(x, axis=0), axis=1) @ (0.5 * (moved[1:] + moved[:-1])) @ FORCE
+    np.testing.assert_allclose(np.sum(forces_of(term, len(u)) * u), work, rtol=1e-6)
+
+
+def test_a_bar_under_traction():
+    """Linear elasticity, Poisson's ratio 0: `u = t s / E`, on the refined mesh too."""
+    mesh = jb.rectangle(3.0, 0.5, 5, 3)
+    left, right = (jb.nodes_where(mesh, lambda x, y, s=s: s * x > 1.49) for s in (-1, 1))
+    body = jb.solid(mesh, jb.lame(1e4, 0.0), jb.linear_elastic)
+    scene = jb.Scene(mesh, (body, jb.traction(mesh, right, [50.0, 0.0])), jb.clamped(mesh, left), right)
+    for each in (scene, jb.enriched(scene)[0]):
+        found = jb.check(jb.equilibrium(each))
+        stretch = 50.0 * (np.asarray(each.mesh.nodes)[:, 0] + 1.5) / 1e4
+        np.testing.assert_allclose(np.asarray(found.x - each.mesh.nodes)[:, 0], stretch, atol=1e-12)
+
+
+def test_bad_tractions_are_refused():
+    mesh = jb.rectangle(2.0, 1.0, 3, 2)
+    with pytest.raises(ValueError, match="at least one edge of the surface, got"):
+        jb.traction(mesh, [0, 5], [0.0, 1.0])
+    with pytest.raises(ValueError, match=r"force: expected shape \(2,\), got \(3,\)"):
+        jb.traction(mesh, [1, 3, 5], [0.0, 1.0, 2.0])
