@@ -30,6 +30,7 @@ from jaxbeam.physics.materials import macklin_mueller as macklin_mueller
 from jaxbeam.physics.materials import neo_hookean as neo_hookean
 from jaxbeam.physics.materials import saint_venant_kirchhoff as saint_venant_kirchhoff
 from jaxbeam.physics.pressure import pressure as pressure
+from jaxbeam.physics.pull import pulls as pulls
 from jaxbeam.physics.solid import solid as solid
 from jaxbeam.physics.spring import penalty_springs as penalty_springs
 from jaxbeam.physics.tendon import constant_stiffness as constant_stiffness

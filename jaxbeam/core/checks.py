@@ -241,11 +241,7 @@ def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
     if not is_concrete(value):
         raise ValueError(f"{name}: expected concrete node numbers, got a traced array")
     shape = "(m,)" if ndim == 1 else "(m, k)"
-    cure = "" if ndim == 1 else "; rows of different lengths, as of tendons with more guides, are terms of their own"
-    try:
-        array = plain(name, value, f"whole numbers of shape {shape}")
-    except ValueError as error:
-        raise ValueError(f"{error}{cure}") from None
+    array = plain(name, value, f"whole numbers of shape {shape}")
     if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
         raise ValueError(f"{name}: expected whole numbers of shape {shape}, got shape {array.shape} of {array.dtype}")
     outside = array[(array < 0) | (array >= total)]

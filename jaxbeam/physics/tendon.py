@@ -80,8 +80,43 @@ def at_means(x: jax.Array, attachment: jax.Array) -> jax.Array:
     return jnp.sum(attachment[:, :, None] * x, axis=1)
 
 
+class LineEnergy(Energy):
+    """What all energies of a line through points of a body have in common: tendons, cables, and those of a user.
+
+    A subclass is a frozen dataclass with the field `points`, and says what its `tension` is. Its parameters have the
+    fields `attachment`, `width` and `ends`, as in `TendonParams`.
+
+    points: from the nodes `x` of the line and its `attachment`, the points that it runs through.
+    """
+
+    points: Callable[[jax.Array, Any], jax.Array]
+    coordinates: ClassVar[int | None] = 2
+
+    def length(self, x: jax.Array, params: Any) -> jax.Array:
+        """Present length `l` `()`."""
+        return polyline_length(self.points(from_first(x), params.attachment))
+
+    def tension(self, x: jax.Array, params: Any) -> jax.Array:
+        """Tension `dE/dl` `()`, the same along the whole line; positive if it pulls."""
+        raise NotImplementedError
+
+    def without_limit(self, term: Term, free: np.ndarray) -> str:
+        if term.params.width is not None or not free[term.nodes].any():
+            return ""
+        return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+
+    def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
+        return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
+
+    def line(self, x: jax.Array, params: Any) -> jax.Array:
+        return jax.vmap(self.points)(x, params.attachment)[..., :2]
+
+    def anchors(self, params: Any) -> tuple[np.ndarray, np.ndarray] | None:
+        return None if params.ends is None else (params.ends, np.asarray(params.width))
+
+
 @dataclasses.dataclass(frozen=True)
-class TendonEnergy(Energy):
+class TendonEnergy(LineEnergy):
     """Energy of one two-way tendon, `1/2 k (l - l*)^2` with `k = stiffness(modulus, l*)`.
 
     `l` is the length of the line through its points, and `l*` the commanded length. The command is the ratio of `l*` to
@@ -94,7 +129,6 @@ class TendonEnergy(Energy):
     stiffness: Callable[[jax.Array, jax.Array], jax.Array]
     points: Callable[[jax.Array, Any], jax.Array] = at_nodes
     name: ClassVar[str] = "tendon"
-    coordinates: ClassVar[int | None] = 2
     rest_command: ClassVar[float | None] = 1.0
     commands: ClassVar[checks.Range] = checks.POSITIVE
     command_unit: ClassVar[float | None] = 1.0
@@ -103,10 +137,6 @@ class TendonEnergy(Energy):
     def __call__(self, x: jax.Array, params: TendonParams) -> jax.Array:
         stretch = self.length(x, params) - params.commanded
         return 0.5 * self.stiffness(params.modulus, params.commanded) * stretch**2
-
-    def length(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        """Present length `l` `()`."""
-        return polyline_length(self.points(from_first(x), params.attachment))
 
     def tension(self, x: jax.Array, params: TendonParams) -> jax.Array:
         """Tension `dE/dl = k (l - l*)` `()`, positive if the tendon pulls."""
@@ -133,20 +163,6 @@ class TendonEnergy(Energy):
         new = tendons(mesh, params.ends, params.modulus, self.stiffness, np.asarray(params.width))
         params = replace(new.params, natural=params.natural, commanded=params.commanded)
         return Term(self, new.nodes, params)
-
-    def without_limit(self, term: Term, free: np.ndarray) -> str:
-        if term.params.width is not None or not free[term.nodes].any():
-            return ""
-        return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
-
-    def measured(self, x: jax.Array, params: TendonParams) -> dict[str, jax.Array]:
-        return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
-
-    def line(self, x: jax.Array, params: TendonParams) -> jax.Array:
-        return jax.vmap(self.points)(x, params.attachment)[..., :2]
-
-    def anchors(self, params: TendonParams) -> tuple[np.ndarray, np.ndarray] | None:
-        return None if params.ends is None else (params.ends, np.asarray(params.width))
 
 
 def from_first(x: Any) -> Any:
@@ -180,7 +196,8 @@ def tendons(
 
     Args:
         mesh: its rest positions determine the natural lengths, which are differentiable in them.
-        nodes: `(m, k)` node numbers: for each tendon its first end, any guides, and its second end.
+        nodes: for each tendon the numbers of its nodes: its first end, any guides, through which it slides, and its
+            second end. `(m, k)`, or a list of rows of different lengths.
         modulus: coefficient of the stiffness law, positive; scalar or `(m,)`.
         stiffness: the law `(modulus, commanded) -> k`, such as `inverse_square_stiffness` (of the reference
             scene; unit of modulus: force x length), `inverse_stiffness` (force) or `constant_stiffness`
@@ -194,13 +211,7 @@ def tendons(
             nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
     """
     check_law(stiffness)
-    lines = check_nodes("nodes", mesh, nodes, ndim=2)
-    if lines.shape[1] < 2:
-        raise ValueError(f"nodes: expected at least two nodes for each tendon, got shape {lines.shape}")
-    ordered = np.sort(lines, axis=1)
-    if (np.diff(ordered, axis=1) == 0).any():
-        k = int(np.flatnonzero((np.diff(ordered, axis=1) == 0).any(axis=1))[0])
-        raise ValueError(f"nodes: tendon {k} repeats a node: {lines[k].tolist()}; give each of its points once")
+    lines = check_lines(mesh, nodes)
     modulus = checks.numbers("modulus", modulus, checks.POSITIVE, ((), lines.shape[:1]))
     if not is_concrete(width):
         raise ValueError("width: expected known numbers, got traced ones; the nodes of a patch depend on its width")
@@ -219,6 +230,20 @@ def tendons(
     xp = namespace(modulus)
     moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
     return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
+
+
+def check_lines(mesh: Mesh, nodes: Any) -> np.ndarray:
+    """Nodes `(m, k)` of lines. Shorter rows of a list are filled up with their last node, which adds no length."""
+    ragged = isinstance(nodes, list | tuple) and len({np.size(row) for row in nodes}) > 1
+    rows = [check_nodes(f"nodes[{k}]", mesh, row, ndim=1) for k, row in enumerate(nodes)] if ragged else []
+    rows = rows or list(check_nodes("nodes", mesh, nodes, ndim=2))
+    for k, row in enumerate(rows):
+        if len(row) < 2:
+            raise ValueError(f"nodes: expected at least two nodes for each tendon, got {row.tolist()} for tendon {k}")
+        if len(np.unique(row)) < len(row):
+            raise ValueError(f"nodes: tendon {k} repeats a node: {row.tolist()}; give each of its points once")
+    most = max(len(row) for row in rows)
+    return np.stack([np.append(row, np.full(most - len(row), row[-1])) for row in rows])
 
 
 def _patch_means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -160,11 +160,14 @@ def _problem(
         xp = namespace(end)
         ends.append(to_device(xp.broadcast_to(xp.asarray(end, dtype), (count,))))
     low, high = ends
-    least = np.concatenate([np.full(term.command_count, term.kind.commands.low) for term in commanded_terms(scene)])
-    if is_concrete(low, high) and not ((np.asarray(low) > least) & (np.asarray(low) <= np.asarray(high))).all():
-        floor = f"{least[0]:g}" if np.all(least == least[0]) else f"{least.tolist()}"
-        above = "" if np.isneginf(least).all() else f"{floor} < "
-        raise ValueError(f"bounds: expected {above}low <= high, got low {low.tolist()} and high {high.tolist()}")
+    if is_concrete(low, high):
+        ranges = [term.kind.commands for term in commanded_terms(scene) for _ in range(term.command_count)]
+        for within, lowest, highest in zip(ranges, np.asarray(low), np.asarray(high), strict=True):
+            if not (within.holds(lowest) and lowest <= highest):
+                floor = "" if np.isneginf(within.low) else f"{within.low:g} {'<=' if within.closed else '<'} "
+                raise ValueError(
+                    f"bounds: expected {floor}low <= high, got low {low.tolist()} and high {high.tolist()}"
+                )
     begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")

@@ -252,9 +252,10 @@ REFUSED = {
     ),
     # Nodes and triangles.
     "ragged guides": (
-        lambda: jb.tendons(MESH, [[0, 4], [1, 3, 5]], 1.0),
-        "nodes: .*; rows of different lengths, as of te",
+        lambda: jb.tendons(MESH, [[0, 4], [1, 3, 99]], 1.0),
+        r"nodes\[1\]: 99 is out of range",
     ),
+    "a short row": (lambda: jb.tendons(MESH, [[0, 4], [1]], 1.0), "two nodes for each tendon, got .* for tendon 1"),
     "masked elements": (lambda: jb.Mesh(SQUARE, np.ma.masked_array([[0, 1, 2]])), "elements: .* got a masked array"),
     "masked clamp": (
         lambda: jb.Scene(MESH, (BODY,), np.ma.masked_array(jb.clamped(MESH, [0]))),

@@ -304,7 +304,7 @@ MESSAGES = {
     "tendons": [
         ({"nodes": [0, 4]}, r"nodes: expected whole numbers of shape \(m, k\), got shape \(2,\)"),
         ({"nodes": [[0.0, 4.0]]}, r"nodes: expected whole numbers of shape \(m, k\), got .*float64"),
-        ({"nodes": [[0]]}, r"nodes: expected at least two nodes for each tendon, got shape \(1, 1\)"),
+        ({"nodes": [[0]]}, r"nodes: expected at least two nodes for each tendon, got \[0\] for tendon 0"),
         ({"nodes": [[0, 6]]}, r"nodes: 6 is out of range, nodes are numbered 0 to 5"),
         ({"nodes": [[-1, 4]]}, r"nodes: -1 is out of range"),
         ({"nodes": [[0, 4], [3, 3]]}, r"nodes: tendon 1 repeats a node: \[3, 3\]"),

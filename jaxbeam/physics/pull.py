@@ -1,0 +1,83 @@
+"""Cables commanded by their tension, as by a weight on a pulley or a force-controlled motor.
+
+With the tension `T` and the present length `l` the energy is `T l`. Its slope in `l` is the tension, whatever the
+length. Without tension there is no energy and no force.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, index_field, namespace, pytree, replace, to_device
+from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.physics.energy import Term
+from jaxbeam.physics.tendon import LineEnergy, tendons
+
+
+@pytree
+class PullParams:
+    """Parameters of `m` cables: `tension` `(m,)`, differentiable, and the others as in `TendonParams`."""
+
+    tension: jax.Array
+    attachment: Any = None
+    width: Any = None
+    ends: Any = index_field(default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class PullEnergy(LineEnergy):
+    """Energy `T l` of one cable. Its command is the tension `T`."""
+
+    points: Callable[[jax.Array, Any], jax.Array]
+    name: ClassVar[str] = "cable"
+    rest_command: ClassVar[float | None] = 0.0
+    commands: ClassVar[checks.Range] = checks.NOT_NEGATIVE
+    command_hint: ClassVar[str] = "it is a tension, and a cable only pulls"
+
+    def __call__(self, x: jax.Array, params: PullParams) -> jax.Array:
+        return params.tension * self.length(x, params)
+
+    def tension(self, x: jax.Array, params: PullParams) -> jax.Array:
+        return params.tension
+
+    def command(self, params: PullParams, values: jax.Array) -> PullParams:
+        return replace(params, tension=to_device(namespace(values).asarray(values, params.tension.dtype)))
+
+    def command_of(self, params: PullParams) -> jax.Array:
+        return params.tension
+
+    def valid(self, params: PullParams) -> jax.Array:
+        return jnp.all(params.tension >= 0)
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        params = term.params
+        return term if params.width is None else pulls(mesh, params.ends, params.tension, np.asarray(params.width))
+
+
+@usual_rules
+def pulls(mesh: Mesh, nodes: Numbers, tension: Numbers = 0.0, width: Numbers = 0.0) -> Term:
+    """Cables under a tension that `command` sets, without tension at rest. They mix with tendons of any kind.
+
+    Args:
+        mesh: as for `tendons`.
+        nodes: as for `tendons`.
+        tension: force, not negative; scalar or `(m,)`; differentiable.
+        width: as for `tendons`.
+
+    Raises:
+        ValueError: as `tendons` does, or if a tension is negative or not finite.
+    """
+    like = tendons(mesh, nodes, 1.0, width=width)
+    tension = checks.numbers("tension", tension, checks.NOT_NEGATIVE, ((), (len(like.nodes),)), "one for each cable")
+    xp = namespace(tension)
+    values = xp.broadcast_to(xp.asarray(tension, mesh.nodes.dtype), (len(like.nodes),))
+    params = PullParams(values, like.params.attachment, like.params.width, like.params.ends)
+    return Term(PullEnergy(like.kind.points), np.asarray(like.nodes), params)  # type: ignore[attr-defined]
