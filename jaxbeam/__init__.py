@@ -16,6 +16,11 @@ from jaxbeam.mesh.rectangle import rectangle as rectangle
 from jaxbeam.mesh.refinement import quadratic as quadratic
 from jaxbeam.mesh.refinement import refined as refined
 from jaxbeam.physics.cable import cables as cables
+from jaxbeam.physics.contact import Obstacle as Obstacle
+from jaxbeam.physics.contact import box as box
+from jaxbeam.physics.contact import contact as contact
+from jaxbeam.physics.contact import disk as disk
+from jaxbeam.physics.contact import half_plane as half_plane
 from jaxbeam.physics.distributed_load import traction as traction
 from jaxbeam.physics.distributed_load import weight as weight
 from jaxbeam.physics.energy import Energy as Energy
@@ -40,8 +45,11 @@ from jaxbeam.physics.tendon import tendons as tendons
 from jaxbeam.scene.beams import rod_beam as rod_beam
 from jaxbeam.scene.beams import tendon_beam as tendon_beam
 from jaxbeam.scene.measures import cauchy_stress as cauchy_stress
+from jaxbeam.scene.measures import contact_forces as contact_forces
+from jaxbeam.scene.measures import contact_pressures as contact_pressures
 from jaxbeam.scene.measures import jacobians as jacobians
 from jaxbeam.scene.measures import nodal_stress as nodal_stress
+from jaxbeam.scene.measures import penetration as penetration
 from jaxbeam.scene.measures import section_rotation as section_rotation
 from jaxbeam.scene.measures import strain_energy as strain_energy
 from jaxbeam.scene.measures import tendon_lengths as tendon_lengths

@@ -120,33 +120,44 @@ def _surface(content: bytes, count: int) -> np.ndarray:
 
 
 def patch(rest: np.ndarray, elements: np.ndarray, node: int, width: float) -> np.ndarray:
-    """Weights `(n,)` of the mean of the surface under a tent of half-width `width` of the arc length from a corner.
+    """Weights `(n,)` of the surface about a corner node, as `jaxbeam.mesh.surface` says what they are.
 
-    Arc length is measured along straight edges; the tent times a shape function is integrated by Gauss's rule.
+    A tent of half-width `width` of the arc length along straight edges, up to turns of more than 45 degrees, times a
+    linear function by which their mean is the node, except across a gentle bend.
     """
     weights, (points, shares) = np.zeros(len(rest)), np.polynomial.legendre.leggauss(4)
     if width == 0:
         weights[node] = 1
         return weights
-    edges = surface(elements)
+    edges, rows, tents = surface(elements), [], []
     for way in (0, 1):
-        here, s = node, 0.0
-        while s < width:
+        here, s, heading = node, 0.0, None
+        while s < width * (1 - 1e-12):
             (edge,) = edges[edges[:, way] == here]
             there = edge[1 - way]
             length = float(np.linalg.norm(rest[there] - rest[here]))
+            direction = (rest[there] - rest[here]) / length
+            if heading is not None and np.degrees(np.arccos(np.clip(direction @ heading, -1, 1))) > 45.573:
+                break
             part = min(1.0, (width - s) / length)
-            t = part * (1 + points) / 2
-            tent = shares * part / 2 * length * (1 - (s + t * length) / width)
-            if len(edge) == 2:
-                values = [1 - t, t]
-            else:
-                values = [(1 - t) * (1 - 2 * t), t * (2 * t - 1), 4 * t * (1 - t)]
-                weights[edge[2]] += tent @ values[2]
-            weights[here] += tent @ values[0]
-            weights[there] += tent @ values[1]
-            here, s = there, s + length
-    return weights / weights.sum()
+            for t, share in zip(part * (1 + points) / 2, shares, strict=True):
+                row = np.zeros(len(rest))
+                if len(edge) == 2:
+                    row[[here, there]] = 1 - t, t
+                else:
+                    row[[here, there, edge[2]]] = (1 - t) * (1 - 2 * t), t * (2 * t - 1), 4 * t * (1 - t)
+                rows.append(row)
+                tents.append(share * part / 2 * length * (1 - (s + t * length) / width))
+            here, s, heading = there, s + length, direction
+    matrix, tent = np.array(rows), np.array(tents) / np.sum(tents)
+    mean = tent @ matrix @ rest
+    away = np.sqrt(tent)[:, None] * (matrix @ rest - mean)
+    left, sizes, right = np.linalg.svd(away, full_matrices=False)
+    shift = np.zeros(len(tent))
+    for k in (0, 1):
+        if sizes[k] ** 2 > 0.01 * sizes[0] ** 2:
+            shift += left[:, k] * (right[k] @ (rest[node] - mean)) / sizes[k]
+    return (tent + np.sqrt(tent) * shift) @ matrix
 
 
 # -------------------------------------------------------------------------------------------- crossings

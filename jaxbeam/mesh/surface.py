@@ -2,9 +2,15 @@
 
 A force on one node is a point load. The displacement of a continuum under a point load is infinite, so the answer grows
 without bound as the mesh is refined. With a patch of finite width the answer has a limit. The position of the anchor is
-the mean of the surface positions `x(s)`, weighted by a tent function of the arc length `s` from the anchor's node:
+a weighted mean of the surface positions `x(s)`, where `s` is the arc length from the anchor's node:
 
-    p = int w(s) x(s) ds / int w(s) ds,     w = max(0, 1 - |s| / width).
+    p = int w(s) x(s) ds,     w = max(0, 1 - |s| / width) (a + b . (X(s) - X(0))).
+
+At rest `p` is the node itself: `a` and `b` are such that the weights have the sum 1 and the mean `X(0)`. In the middle
+of a straight side `b` is zero, and the weights are a tent. At the end of a side, where a tent has its mean inside the
+body, some weights are negative: together the forces on the patch are the force at the node, and have no moment about
+it. (Such weights are those of the reproducing kernel method, Liu, Jun and Zhang 1995, Int. J. Numer. Methods Fluids 20,
+1081-1106.) On a surface that bends gently the mean keeps the small distance that the bend makes.
 
 `x(s)` is interpolated by the shape functions, so `p` is a weighted mean of nodes, with weights of sum 1.
 """
@@ -21,15 +27,20 @@ from jaxbeam.mesh.element import edge_functions
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
 
-# Gauss's rule of two points on (0, 1): exact for a shape function times the tent function.
-_POINTS = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
+# Gauss's rule of three points on (0, 1): exact for a shape function times the weights, on a straight edge.
+_POINTS, _SHARES = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, np.polynomial.legendre.leggauss(3)[1] / 2
+# Cosine of the turn from one edge to the next, here 45 degrees, at which a patch ends: a corner of the body.
+CORNER = 0.7
+# Variances of the patch below this share of the largest are those of a gentle bend, along which the mean is not moved.
+BEND = 1e-2
 
 
 def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Nodes `(k,)` of the patch of surface about a corner `node`, `node` first, and their weights `(k,)`.
 
-    The patch reaches the arc length `width` to either side, also round corners of the body. Edges are taken as straight
-    to measure it. A patch of width 0 is the node alone.
+    The patch reaches the arc length `width` to either side, but not round a corner of the body, where the surface turns
+    by more than 45 degrees. At such a corner it lies on both sides of it. Edges are taken as straight to measure arc
+    length. A patch of width 0 is the node alone.
 
     Raises:
         ValueError: if the nodes are traced, the node is not a corner of a triangle on the surface, or the surface
@@ -40,20 +51,39 @@ def patch(mesh: Mesh, node: int, width: float) -> tuple[np.ndarray, np.ndarray]:
     if not is_concrete(mesh.nodes):
         raise ValueError("width: an anchor of finite width needs concrete nodes; build the mesh outside jit and grad")
     positions = np.asarray(mesh.nodes, float)
-    weights = {node: 0.0}
+    # At each quadrature point of each edge: the tent times the length, the values of the shape functions, the place.
+    lines, tents, values, places = [], [], [], []
     for line, s, length, share in walk(positions, surface(mesh), node, width):
         xi = share * _POINTS
-        tent = 0.5 * share * length * (1 - (s + length * xi) / width)
-        for number, values in zip(line, edge_functions(len(line), xi).T, strict=True):
-            weights[number] = weights.get(number, 0.0) + float(tent @ values)
-    nodes, values = np.array(list(weights)), np.array(list(weights.values()))
-    return nodes, values / values.sum()
+        lines.append(line)
+        tents.append(share * length * _SHARES * (1 - (s + length * xi) / width))
+        values.append(edge_functions(len(line), xi))
+        places.append(values[-1] @ (positions[line] - positions[node]) / width)
+    factors = _balancing(np.concatenate(tents), np.concatenate(places)).reshape(len(lines), -1)
+    weights = {node: 0.0}
+    for line, tent, factor, functions in zip(lines, tents, factors, values, strict=True):
+        for number, weight in zip(line, (tent * factor) @ functions, strict=True):
+            weights[number] = weights.get(number, 0.0) + float(weight)
+    return np.array(list(weights)), np.array(list(weights.values()))
+
+
+def _balancing(tents: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Factors `a + b . place` `(q,)` of the weights `tents` `(q,)`: their sum becomes 1, the mean of `places` 0."""
+    mean = tents @ places / tents.sum()
+    away = places - mean
+    variances, axes = np.linalg.eigh((tents[:, None] * away).T @ away / tents.sum())
+    kept = axes[:, variances > BEND * variances[-1]]
+    # Along the axes that are kept the mean moves to 0.
+    slope = kept @ ((kept.T @ -mean) / variances[variances > BEND * variances[-1]])
+    return (1 + away @ slope) / tents.sum()
 
 
 def walk(
     positions: np.ndarray, edges: np.ndarray, node: int, width: float
 ) -> Iterator[tuple[list[int], float, float, float]]:
     """The edges of a surface within the arc length `width` of a node: first one way round the body, then the other.
+
+    Each way ends at the first corner of the body.
 
     Yields:
         For each edge: its nodes in the direction of the walk; the arc length at its beginning; its length; and the
@@ -64,7 +94,7 @@ def walk(
     """
     for ways in (edges, edges[:, [1, 0, 2][: edges.shape[1]]]):
         following = {line[0]: line for line in ways.tolist()}
-        here, s, left = node, 0.0, len(ways)
+        here, s, left, before = node, 0.0, len(ways), np.zeros(2)
         while s < (1 - 1e-9) * width:
             # `left` ends a walk that never comes back: where two parts of a body touch at a node, it may go round the
             # other part for ever.
@@ -72,7 +102,11 @@ def walk(
                 problem = "is not a corner on the surface" if s == 0 else "has a surface shorter than the width"
                 raise ValueError(f"width: node {node} {problem}, so it has no patch of width {width:g}")
             line = following[here]
-            length = float(np.linalg.norm(positions[line[1]] - positions[line[0]]))
+            chord = positions[line[1]] - positions[line[0]]
+            length = float(np.linalg.norm(chord))
+            if s > 0 and chord @ before < CORNER * length:
+                break
+            before = chord / length
             yield line, s, length, min(1.0, (width - s) / length)
             here, s, left = line[1], s + length, left - 1
 

@@ -194,6 +194,9 @@ def tendons(
 ) -> Term:
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
 
+    They are two-way springs: one that is longer than its ends are apart pushes. At ratios (1.2, 1) the top tendon of
+    the reference scene pushes with 125. `cables` only pull.
+
     Args:
         mesh: its rest positions determine the natural lengths, which are differentiable in them.
         nodes: for each tendon the numbers of its nodes: its first end, any guides, through which it slides, and its

@@ -88,6 +88,24 @@ def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 @one_program
+def contact_forces(scene: Scene, x: jax.Array) -> jax.Array:
+    """Force of the obstacle on each edge that may touch one, `(m, 2)`, over all terms of contact."""
+    return _measured(scene, x, "contact_force", (2,))
+
+
+@one_program
+def contact_pressures(scene: Scene, x: jax.Array) -> jax.Array:
+    """Largest pressure on each edge that may touch an obstacle, `(m,)`, of those at its quadrature points."""
+    return _measured(scene, x, "contact_pressure")
+
+
+@one_program
+def penetration(scene: Scene, x: jax.Array) -> jax.Array:
+    """How deep each edge that may touch an obstacle lies inside it, `(m,)`; zero outside."""
+    return _measured(scene, x, "penetration")
+
+
+@one_program
 def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     """Cauchy stress `(t, 2, 2)` in the plane, one for each element of the solid: `P F^T / J`.
 
@@ -165,11 +183,11 @@ def _points_to_nodes(element: Element, points: int) -> np.ndarray:
     return element.places @ (np.linalg.pinv(root[:, None] * places) * root)
 
 
-def _measured(scene: Scene, x: jax.Array, name: str) -> jax.Array:
-    """What the terms measure under this name, `(m,)`, in their order."""
+def _measured(scene: Scene, x: jax.Array, name: str, shape: tuple[int, ...] = ()) -> jax.Array:
+    """What the terms measure under this name, `(m, *shape)`, in their order."""
     x = placed(scene, x)
     found = [term.kind.measured(x[term.nodes], term.params) for term in scene.terms]
-    return jnp.concatenate([*(each[name] for each in found if name in each), jnp.zeros(0, x.dtype)])
+    return jnp.concatenate([*(each[name] for each in found if name in each), jnp.zeros((0, *shape), x.dtype)])
 
 
 def _tip(scene: Scene) -> np.ndarray:

@@ -219,7 +219,7 @@ def _judge(task: Task, state: SearchState, new: Trial) -> None:
         state.here = new
         state.scale = max(state.scale, float(np.sum(new.slope**2)))
         state.radius = min(RADIUS, 4 * state.radius)
-        state.seen = state.seen | effects(task, new)
+        state.seen = state.seen | moved_by(task, new)
     else:
         state.radius = 0.25 * float(np.max(np.abs(state.step)))
 
@@ -244,12 +244,24 @@ def _plan(task: Task, state: SearchState) -> None:
     state.resting = rest and not state.probing
 
 
+def moved_by(task: Task, at: Trial) -> np.ndarray:
+    """Which commands, `(m,)`, move the measure by more than its round-off, to first order.
+
+    An effect of second order alone tells no way: where a cable begins to pull, the slope is zero, and the search would
+    rest there.
+    """
+    return (np.abs(at.slope) > _round_off(task, at)[:, None]).any(axis=0)
+
+
 def effects(task: Task, at: Trial) -> np.ndarray:
     """Which commands, `(m,)`, have an effect on the measure above its round-off, to first or second order."""
-    eps = np.finfo(task.scene.mesh.nodes.dtype).eps
-    round_off = eps * (np.abs(task.target) + np.abs(at.miss))
     most = np.maximum(np.abs(at.slope), np.max(np.abs(at.bend), axis=2))
-    return (most > round_off[:, None]).any(axis=0)
+    return (most > _round_off(task, at)[:, None]).any(axis=0)
+
+
+def _round_off(task: Task, at: Trial) -> np.ndarray:
+    """Round-off `(p,)` of the measure."""
+    return np.finfo(task.scene.mesh.nodes.dtype).eps * (np.abs(task.target) + np.abs(at.miss))
 
 
 def _status(task: Task, state: SearchState) -> DesignStatus:

@@ -147,6 +147,14 @@ def cabled(transition=0.01):
     return jb.Scene(BEAM.mesh, (body, cables), BEAM.fixed, BEAM.tip)
 
 
+@pytest.fixture(scope="module")
+def reference():
+    """The reference scene with cables, which become taut over a thousandth of their length."""
+    plain = jb.tendon_beam()
+    cables = jb.cables(plain.mesh, plain.terms[1].nodes, 2e3, transition=1e-3)
+    return jb.Scene(plain.mesh, (plain.terms[0], cables), plain.fixed, plain.tip)
+
+
 def test_a_slack_cable_does_nothing():
     """Longer than its ends are apart: no energy, no force, exactly. A two-way tendon would push."""
     scene = jb.command(cabled(), [1.2, 1.1])
@@ -156,6 +164,26 @@ def test_a_slack_cable_does_nothing():
     assert float(found.energy) == 0
     pushed = jb.command(BEAM, [1.2, 1.1])
     assert (np.asarray(jb.tendon_tensions(pushed, jb.equilibrium(pushed).x)) < 0).all()
+
+
+def test_the_reference_beam_with_cables(reference):
+    """At (0.6, 1.4) the slack one reads exactly zero, and the angle is 24.06 degrees.
+
+    Two-way tendons give 27.345: there the longer one pushes."""
+    scene = jb.command(reference, [0.6, 1.4])
+    found = jb.check(jb.equilibrium(scene))
+    tensions = np.asarray(jb.tendon_tensions(scene, found.x))
+    assert tensions[1] == 0 and tensions[0] > 500
+    assert abs(float(jb.tip_angle(scene, found.x)) - 24.06) < 0.01
+
+
+@pytest.mark.parametrize("target", [10.0, -10.0])
+def test_reach_from_rest_where_no_cable_pulls_yet(reference, target):
+    """Where a cable begins to pull, the angle has no slope in the ratio. One of them pulls in the end."""
+    found = jb.reach(reference, target)
+    assert found.status == jb.DesignStatus.REACHED and found.solves <= 8
+    np.testing.assert_allclose(found.value, target, atol=1e-8)
+    assert np.sort(np.asarray(found.theta))[1] == 1 and 0.7 < np.min(found.theta) < 0.8
 
 
 def test_a_taut_cable_is_a_tendon_of_a_longer_command():

@@ -79,7 +79,8 @@ def test_patch_is_a_mean_under_a_tent():
         mesh = jb.rectangle(4.0, 1.0, 9, 3, order=order)
         nodes = np.asarray(mesh.nodes)
         weights = patch(nodes, mesh.elements, 14, 1.0)
-        assert np.count_nonzero(weights) == (5 if order == 1 else 9)
+        # The shape function of the last corner is zero under the tent, on average.
+        assert np.count_nonzero(np.abs(weights) > 1e-12) == (5 if order == 1 else 7)
         np.testing.assert_allclose(weights @ nodes, nodes[14], atol=1e-15)
         if order == 2:
             np.testing.assert_allclose(weights @ (nodes[:, 0] - nodes[14, 0]) ** 2, 1 / 6, rtol=1e-13)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import disturbed, l_shape
+from helpers import annulus, disturbed, l_shape
 
 import jaxbeam as jb
 from jaxbeam.core.tree import replace
@@ -107,28 +107,55 @@ def test_patch_is_the_mean_of_the_surface(order, width):
         assert weights @ (X[:, 0] - 0.25) ** 2 == pytest.approx(width**2 / 6, rel=1e-12)
 
 
-def test_patch_goes_round_corners_and_refuses_what_has_none():
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("place", [[1.0, 0.5], [1.0, -0.5], [0.5, 0.5], [1.0, 0.0], [0.0, -0.5]])
+@pytest.mark.parametrize("width", [0.3, 0.6, 0.9, 100.0])
+def test_an_anchor_is_at_its_node(order, place, width):
+    """At a corner, beside one and in the middle of a side, whether the patch ends at a corner or not: the weighted mean
+    is the node, and a force at the anchor has the moment of one at the node."""
+    mesh = jb.rectangle(2.0, 1.0, 9, 5, order=order)
+    node = jb.nearest_node(mesh, place)
+    nodes, weights = patch(mesh, node, width)
+    at = np.asarray(mesh.nodes)[nodes]
+    np.testing.assert_allclose(weights.sum(), 1, rtol=1e-13)
+    np.testing.assert_allclose(weights @ at, place, atol=1e-13)
+    # It lies on the sides that the node is on, and on no other.
+    sides = [np.abs(at[:, k] - place[k]) < 1e-12 for k in (0, 1) if abs(place[k]) == (1.0, 0.5)[k]]
+    assert np.any(sides, axis=0).all()
+
+
+def test_a_patch_on_a_gentle_bend_is_a_tent():
+    """On a ring of 96 edges it has positive weights, and its mean lies inside by the bend alone."""
+    mesh = annulus(96, 3)
+    rest = np.asarray(mesh.nodes)
+    node = int(np.argmax(np.linalg.norm(rest, axis=1)))
+    radius = np.linalg.norm(rest[node])
+    nodes, weights = patch(mesh, node, 0.25 * radius)
+    assert (weights > 0).all() and len(nodes) > 5
+    # `s^2 / (2 R)` under a tent; the rest is that the ring is a polygon.
+    inside = radius - np.linalg.norm(weights @ rest[nodes])
+    np.testing.assert_allclose(inside, 0.25**2 / 12 * radius, rtol=0.1)
+    with pytest.raises(ValueError, match="shorter than the width"):
+        patch(mesh, node, 100.0)
+
+
+def test_patches_are_refused_off_the_surface():
     mesh = jb.rectangle(2.0, 1.0, 5, 3)
-    corner = jb.nearest_node(mesh, [1.0, 0.5])
-    nodes, weights = patch(mesh, corner, 0.5)
-    mean = weights @ np.asarray(mesh.nodes)[nodes]
-    np.testing.assert_allclose(mean, [1 - 0.5 / 6, 0.5 - 0.5 / 6], atol=1e-14)
     assert len(surface(mesh)) == 2 * (4 + 2)
     with pytest.raises(ValueError, match="not a corner on the surface"):
         patch(mesh, jb.nearest_node(mesh, [0.0, 0.0]), 0.1)
-    with pytest.raises(ValueError, match="shorter than the width"):
-        patch(mesh, corner, 100.0)
     with pytest.raises(ValueError, match="anchor_width: expected a finite number of at least 0"):
         jb.tendon_beam(5, 3, anchor_width=-1.0)
 
 
 def test_patch_of_two_triangles_that_touch_at_a_node():
-    """The surface leads from the one round and round the other."""
+    """It stays on the sides of its own corner."""
     nodes = np.array([[0.0, 0.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0], [2.0, 1.0]])
     mesh = jb.Mesh(nodes, [[0, 1, 2], [0, 3, 4]])
-    for node in (1, 3):
-        with pytest.raises(ValueError, match="shorter than the width"):
-            patch(mesh, node, 1e3)
+    for node, own in ((1, {0, 1, 2}), (3, {0, 3, 4})):
+        members, weights = patch(mesh, node, 1e3)
+        assert set(members.tolist()) == own
+        np.testing.assert_allclose(weights @ nodes[members], nodes[node], atol=1e-12)
 
 
 def test_no_width_is_a_point():

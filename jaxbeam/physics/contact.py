@@ -1,0 +1,246 @@
+"""Contact of the surface of a body with rigid obstacles, without friction.
+
+An obstacle is a function of a point that is its distance from the obstacle, negative inside. Where the surface of the
+body is at the distance `g`, the obstacle pushes with the pressure
+
+    p = k w h'(-g / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1).
+
+It is zero outside, and deep inside it grows by the stiffness `k` with each unit of depth. Over the transition width `w`
+it sets in smoothly, as Newton's method needs. Its potential is `k w^2 h(-g / w)` on each length of the surface at rest.
+This is the penalty method (Wriggers, "Computational Contact Mechanics", 2006, section 6.3): the surface sinks in by
+about `p / k`, a depth that falls as one over the stiffness.
+
+There is no friction, and a body does not touch itself or another body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.core import checks
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
+from jaxbeam.mesh.element import edge_functions, edge_slopes
+from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.surface import edges_between, finer_edges
+from jaxbeam.physics.energy import Energy, Term, check_nodes
+
+# Gauss's rule of three points on each edge.
+_XI, _SHARES = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, np.polynomial.legendre.leggauss(3)[1] / 2
+
+Distance = Callable[[jax.Array, Any], jax.Array]
+
+
+@pytree
+class Obstacle:
+    """A rigid shape.
+
+    distance: `(point, params) -> ()`, the signed distance of a point `(2,)`, negative inside; a function of a module.
+    params: its parameters, a pytree of arrays; differentiable.
+    """
+
+    distance: Distance = static_field()
+    params: Any
+
+
+def half_plane(point: Numbers, normal: Numbers) -> Obstacle:
+    """All points behind the line through `point` `(2,)`. `normal` `(2,)`, of any length, points out of it."""
+    xp = namespace(point, normal)
+    away = xp.asarray(checks.numbers("normal", normal, shapes=((2,),)))
+    length = xp.sqrt(xp.sum(away**2))
+    if is_concrete(length) and not length > 0:
+        raise ValueError("normal: expected a vector of positive length, got [0, 0]")
+    return Obstacle(_behind_line, (xp.asarray(checks.numbers("point", point, shapes=((2,),))), away / length))
+
+
+def disk(centre: Numbers, radius: Numbers) -> Obstacle:
+    """A disk with its centre `(2,)` and its radius, positive."""
+    xp = namespace(centre, radius)
+    place = xp.asarray(checks.numbers("centre", centre, shapes=((2,),)))
+    return Obstacle(_from_disk, (place, xp.asarray(checks.number("radius", radius, checks.POSITIVE))))
+
+
+def box(centre: Numbers, size: Numbers, angle: Numbers = 0.0) -> Obstacle:
+    """A rectangle with its centre `(2,)`, its width and height `(2,)`, and its angle in degrees, anticlockwise."""
+    xp = namespace(centre, size, angle)
+    place = xp.asarray(checks.numbers("centre", centre, shapes=((2,),)))
+    sides = xp.asarray(checks.numbers("size", size, checks.POSITIVE, ((2,),)))
+    return Obstacle(_from_box, (place, 0.5 * sides, xp.deg2rad(xp.asarray(checks.number("angle", angle)))))
+
+
+def _behind_line(point: jax.Array, params: Any) -> jax.Array:
+    place, normal = params
+    return jnp.sum((point - place) * normal)
+
+
+def _from_disk(point: jax.Array, params: Any) -> jax.Array:
+    centre, radius = params
+    return _length(point - centre) - radius
+
+
+def _from_box(point: jax.Array, params: Any) -> jax.Array:
+    centre, half, angle = params
+    x, y = point - centre
+    turned = jnp.stack([jnp.cos(angle) * x + jnp.sin(angle) * y, jnp.cos(angle) * y - jnp.sin(angle) * x])
+    beyond = jnp.abs(turned) - half
+    return _length(jnp.maximum(beyond, 0)) + jnp.minimum(jnp.max(beyond), 0)
+
+
+def _length(vector: jax.Array) -> jax.Array:
+    """Length `()`, with derivatives of zero, and not NaN, where it is zero."""
+    squared = jnp.sum(vector**2)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+
+
+@pytree
+class ContactParams:
+    """Parameters of `m` edges.
+
+    shape: parameters of the obstacle, each with leading axis `m`, all alike.
+    lengths: `(m, q)` length at rest of each quadrature point's part of the edge.
+    stiffness: `(m,)` pressure per depth.
+    transition: `(m,)` depth over which the pressure sets in.
+    moved: `(m,)` how far the obstacle is moved along its direction, all alike.
+    direction: `(m, 2)` unit vector, all alike.
+    """
+
+    shape: Any
+    lengths: jax.Array
+    stiffness: jax.Array
+    transition: jax.Array
+    moved: jax.Array
+    direction: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactEnergy(Energy):
+    """Potential of the pressure of one obstacle on one edge. Its command moves the obstacle along a direction.
+
+    distance: as of the `Obstacle`.
+    """
+
+    distance: Distance
+    name: ClassVar[str] = "contact"
+    coordinates: ClassVar[int | None] = 2
+    rest_command: ClassVar[float | None] = 0.0
+    shared_command: ClassVar[bool] = True
+    command_hint: ClassVar[str] = "it is how far the obstacle is moved along its direction"
+
+    def __call__(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        t = self._depths(x, params)
+        rising, deep = jnp.clip(t, 0, 1), jnp.maximum(t, 1)
+        shape = jnp.where(t < 1, rising**3 / 6, 0.5 * (deep - 0.5) ** 2 + 1 / 24)
+        return params.stiffness * params.transition**2 * jnp.sum(params.lengths * shape)
+
+    def gaps(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        """Distance of the edge from the obstacle at its quadrature points, `(q,)`."""
+        points = jnp.asarray(edge_functions(len(x), _XI), x.dtype) @ x - params.moved * params.direction
+        return jax.vmap(self.distance, in_axes=(0, None))(points, params.shape)
+
+    def pressures(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        """Pressure at the quadrature points of the edge, `(q,)`."""
+        t = self._depths(x, params)
+        shape = jnp.where(t < 1, 0.5 * jnp.clip(t, 0, 1) ** 2, jnp.maximum(t, 1) - 0.5)
+        return params.stiffness * params.transition * shape
+
+    def _depths(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        return -self.gaps(x, params) / params.transition
+
+    def command(self, params: ContactParams, values: jax.Array) -> ContactParams:
+        xp = namespace(values)
+        return replace(params, moved=xp.broadcast_to(xp.asarray(values, params.moved.dtype), params.moved.shape))
+
+    def command_of(self, params: ContactParams) -> jax.Array:
+        return params.moved[:1]
+
+    def valid(self, params: ContactParams) -> jax.Array:
+        return jnp.all((params.stiffness > 0) & (params.transition > 0))
+
+    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+        edges, parents = finer_edges(mesh, term.nodes)
+        params = jax.tree.map(lambda leaf: np.asarray(leaf)[parents], term.params)
+        return Term(self, edges, replace(params, lengths=_lengths(mesh, edges)))
+
+    def measured(self, x: jax.Array, params: ContactParams) -> dict[str, jax.Array]:
+        gaps = jax.vmap(self.gaps)(x, params)
+        return {
+            "penetration": jnp.maximum(-jnp.min(gaps, axis=1), 0),
+            "contact_pressure": jnp.max(jax.vmap(self.pressures)(x, params), axis=1),
+            "contact_force": -jnp.sum(self.gradients(x, params)[1], axis=1),
+        }
+
+
+@usual_rules
+def contact(
+    mesh: Mesh,
+    nodes: Numbers,
+    obstacle: Obstacle,
+    stiffness: Numbers,
+    transition: Numbers,
+    direction: Numbers = (0.0, 1.0),
+) -> Term:
+    """Contact of part of the surface with a rigid obstacle, without friction. `command` moves the obstacle.
+
+    Args:
+        mesh: of triangles; differentiable in its nodes.
+        nodes: `(m,)` node numbers. The edges of the surface of which both corners are among them may touch it.
+        obstacle: `half_plane(...)`, `disk(...)`, `box(...)`, or an `Obstacle` with a distance of your own.
+        stiffness: pressure per depth (force per volume, thickness 1), positive; differentiable. The body sinks in by
+            about the pressure over the stiffness.
+        transition: depth over which the pressure sets in, a length, positive; differentiable.
+        direction: `(2,)` along which a command moves the obstacle, of any length; one command for all edges.
+
+    Raises:
+        ValueError: if a node is out of range, no edge of the surface lies between the nodes, an argument has another
+            shape or is out of its range, or the body lies inside the obstacle at rest.
+    """
+    check_triangles(mesh)
+    edges = edges_between(mesh, check_nodes("nodes", mesh, nodes, ndim=1))
+    checks.instance("obstacle", obstacle, Obstacle, "make one with half_plane, disk or box")
+    numbers = [checks.number("stiffness", stiffness, checks.POSITIVE)]
+    numbers.append(checks.number("transition", transition, checks.POSITIVE))
+    toward = checks.numbers("direction", direction, shapes=((2,),))
+    xp, dtype, count = namespace(toward), mesh.nodes.dtype, len(edges)
+    every = lambda value: namespace(value).broadcast_to(
+        namespace(value).asarray(value, dtype), (count, *np.shape(value))
+    )
+    params = ContactParams(
+        shape=jax.tree.map(every, obstacle.params),
+        lengths=_lengths(mesh, edges),
+        stiffness=every(numbers[0]),
+        transition=every(numbers[1]),
+        moved=every(0.0),
+        direction=every(xp.asarray(toward) / xp.sqrt(xp.sum(xp.asarray(toward) ** 2))),
+    )
+    term = Term(ContactEnergy(obstacle.distance), edges, params)
+    _check_outside(mesh, term)
+    return term
+
+
+def _check_outside(mesh: Mesh, term: Term) -> None:
+    """Refuse an obstacle that holds part of the surface inside at rest."""
+    if not is_concrete(mesh.nodes, *jax.tree.leaves(term.params)):
+        return
+    gaps = np.asarray(jax.jit(jax.vmap(term.energy.gaps))(np.asarray(mesh.nodes)[term.nodes], term.params))  # type: ignore[attr-defined]
+    # A surface that lies on the obstacle touches it up to round-off.
+    size = np.ptp(np.asarray(mesh.nodes), axis=0).max()
+    if gaps.min() < -1e-6 * size:
+        k = int(np.argmin(gaps.min(axis=1)))
+        raise ValueError(
+            f"obstacle: the edge between nodes {term.nodes[k, 0]} and {term.nodes[k, 1]} lies {-gaps.min():.3g} inside "
+            f"it at rest; place it outside, and move it in by its command"
+        )
+
+
+def _lengths(mesh: Mesh, edges: np.ndarray) -> Any:
+    """Length at rest of the part of each quadrature point of edges `(m, k)`, `(m, q)`."""
+    xp, dtype = namespace(mesh.nodes), mesh.nodes.dtype
+    rest = xp.asarray(mesh.nodes)[edges]
+    along = xp.einsum("qk,mkd->mqd", xp.asarray(edge_slopes(edges.shape[1], _XI), dtype), rest - rest[:, :1])
+    return xp.sqrt(xp.sum(along**2, axis=2)) * xp.asarray(_SHARES, dtype)
