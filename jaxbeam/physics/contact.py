@@ -43,10 +43,13 @@ class Obstacle:
 
     distance: `(point, params) -> ()`, the signed distance of a point `(2,)`, negative inside; a function of a module.
     params: its parameters, a pytree of arrays; differentiable.
+    stride: `()` how far it may move from one solved state to the next, a quarter of its thickness; None: any. If it
+        moved farther, the body could come out on its other side.
     """
 
     distance: Distance = static_field()
     params: Any
+    stride: Any = None
 
 
 def half_plane(point: Numbers, normal: Numbers) -> Obstacle:
@@ -63,7 +66,8 @@ def disk(centre: Numbers, radius: Numbers) -> Obstacle:
     """A disk with its centre `(2,)` and its radius, positive."""
     xp = namespace(centre, radius)
     place = xp.asarray(checks.numbers("centre", centre, shapes=((2,),)))
-    return Obstacle(_from_disk, (place, xp.asarray(checks.number("radius", radius, checks.POSITIVE))))
+    size = xp.asarray(checks.number("radius", radius, checks.POSITIVE))
+    return Obstacle(_from_disk, (place, size), 0.5 * size)
 
 
 def box(centre: Numbers, size: Numbers, angle: Numbers = 0.0) -> Obstacle:
@@ -71,7 +75,8 @@ def box(centre: Numbers, size: Numbers, angle: Numbers = 0.0) -> Obstacle:
     xp = namespace(centre, size, angle)
     place = xp.asarray(checks.numbers("centre", centre, shapes=((2,),)))
     sides = xp.asarray(checks.numbers("size", size, checks.POSITIVE, ((2,),)))
-    return Obstacle(_from_box, (place, 0.5 * sides, xp.deg2rad(xp.asarray(checks.number("angle", angle)))))
+    turn = xp.deg2rad(xp.asarray(checks.number("angle", angle)))
+    return Obstacle(_from_box, (place, 0.5 * sides, turn), 0.25 * xp.min(sides))
 
 
 def _behind_line(point: jax.Array, params: Any) -> jax.Array:
@@ -108,6 +113,7 @@ class ContactParams:
     transition: `(m,)` depth over which the pressure sets in.
     moved: `(m,)` how far the obstacle is moved along its direction, all alike.
     direction: `(m, 2)` unit vector, all alike.
+    stride: `(m,)` as of the `Obstacle`, all alike; or None.
     """
 
     shape: Any
@@ -116,6 +122,7 @@ class ContactParams:
     transition: jax.Array
     moved: jax.Array
     direction: jax.Array
+    stride: Any = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +166,29 @@ class ContactEnergy(Energy):
     def command_of(self, params: ContactParams) -> jax.Array:
         return params.moved[:1]
 
+    def stride(self, params: ContactParams) -> jax.Array | None:
+        return None if params.stride is None else params.stride[0]
+
+    def longest_step(self, x: jax.Array, dx: jax.Array, params: ContactParams, keep: float) -> jax.Array | None:
+        """No node of the surface moves farther than the stride in one step of Newton's method."""
+        if params.stride is None:
+            return None
+        farthest = jnp.max(jnp.abs(dx), axis=(1, 2))
+        return params.stride / jnp.where(farthest > 0, farthest, 1)
+
+    def margin(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        """Negative where the surface has come out on the other side of the obstacle, which is then inside the body."""
+
+        def of_edge(x: jax.Array, params: ContactParams) -> jax.Array:
+            along = jnp.asarray(edge_slopes(len(x), _XI), x.dtype) @ x
+            outward = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
+            points = jnp.asarray(edge_functions(len(x), _XI), x.dtype) @ x - params.moved * params.direction
+            gaps, away = jax.vmap(jax.value_and_grad(self.distance), in_axes=(0, None))(points, params.shape)
+            facing = jnp.sum(outward * away, axis=1) / jnp.linalg.norm(outward, axis=1)
+            return jnp.min(jnp.where((gaps < 0) & (facing > 0), -facing, jnp.inf))
+
+        return jax.vmap(of_edge)(x, params)
+
     def valid(self, params: ContactParams) -> jax.Array:
         return jnp.all((params.stiffness > 0) & (params.transition > 0))
 
@@ -198,7 +228,8 @@ def contact(
 
     Raises:
         ValueError: if a node is out of range, no edge of the surface lies between the nodes, an argument has another
-            shape or is out of its range, or the body lies inside the obstacle at rest.
+            shape or is out of its range, the body lies inside the obstacle at rest, or the obstacle is thinner than an
+            edge is long.
     """
     check_triangles(mesh)
     edges = edges_between(mesh, check_nodes("nodes", mesh, nodes, ndim=1))
@@ -217,6 +248,7 @@ def contact(
         transition=every(numbers[1]),
         moved=every(0.0),
         direction=every(xp.asarray(toward) / xp.sqrt(xp.sum(xp.asarray(toward) ** 2))),
+        stride=None if obstacle.stride is None else every(obstacle.stride),
     )
     term = Term(ContactEnergy(obstacle.distance), edges, params)
     _check_outside(mesh, term)
@@ -224,7 +256,7 @@ def contact(
 
 
 def _check_outside(mesh: Mesh, term: Term) -> None:
-    """Refuse an obstacle that holds part of the surface inside at rest."""
+    """Refuse an obstacle that holds part of the surface inside at rest, or is thinner than an edge is long."""
     if not is_concrete(mesh.nodes, *jax.tree.leaves(term.params)):
         return
     gaps = np.asarray(jax.jit(jax.vmap(term.energy.gaps))(np.asarray(mesh.nodes)[term.nodes], term.params))  # type: ignore[attr-defined]
@@ -235,6 +267,12 @@ def _check_outside(mesh: Mesh, term: Term) -> None:
         raise ValueError(
             f"obstacle: the edge between nodes {term.nodes[k, 0]} and {term.nodes[k, 1]} lies {-gaps.min():.3g} inside "
             f"it at rest; place it outside, and move it in by its command"
+        )
+    stride, longest = term.params.stride, float(np.sum(np.asarray(term.params.lengths), axis=1).max())
+    if stride is not None and 4 * float(stride[0]) < longest:
+        raise ValueError(
+            f"obstacle: its thickness is {4 * float(stride[0]):.3g}, less than the longest edge that may touch it, "
+            f"{longest:.3g}, between whose points it could pass; refine the mesh there"
         )
 
 

@@ -82,6 +82,10 @@ class Energy:
             return params
         return self.command(params, (1 - share) * self.rest_command + share * self.command_of(params))
 
+    def stride(self, params: Any) -> jax.Array | None:
+        """The largest change of a command, `()`, from one solved state to the next; None: any."""
+        return None
+
     # ----------------------------------------------------------------------------- ranges and bounds
 
     def valid(self, params: Any) -> Any:

@@ -347,6 +347,20 @@ def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return every[element], element.astype(jnp.int32)
 
 
+def longest_increment(start: Scene, end: Scene) -> jax.Array | None:
+    """The largest share `()` of the way between two scenes that may be taken in one solve; None: all of it.
+
+    Some energies limit the change of their commands, see `Energy.stride`.
+    """
+    limits = []
+    for here, there in zip(start.terms, end.terms, strict=True):
+        stride = there.kind.stride(there.params)
+        if stride is not None:
+            change = jnp.max(jnp.abs(there.kind.command_of(there.params) - here.kind.command_of(here.params)))
+            limits.append(stride / jnp.maximum(change, stride))
+    return jnp.min(jnp.stack(limits)) if limits else None
+
+
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
     """Largest `t` `()` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
 

@@ -22,11 +22,11 @@ from jax import lax
 from jaxbeam.core.compiling import choose
 from jaxbeam.linear.layout import Layout
 from jaxbeam.scene.overlap import crossing
-from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, worst_element
+from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, longest_increment, worst_element
 from jaxbeam.solve import newton
 from jaxbeam.solve.newton import INACCURATE, Newton
 from jaxbeam.solve.predictor import Trail, extend, predict
-from jaxbeam.solve.report import PackedReport, Report, pack, unpack, zeros
+from jaxbeam.solve.report import PackedReport, Report, unpack, write, zeros
 from jaxbeam.solve.solution import Solution, Status
 from jaxbeam.solve.stiffness import zero_factor
 
@@ -60,6 +60,7 @@ class Problem(NamedTuple):
     valid: `(S,)` whether every parameter of the scene is in its range at each target.
     noise: `(n, d)` random forces; the response to them shows the soft modes.
     solver: settings of Newton's method.
+    longest: `()` the largest increment; None: any.
     """
 
     scene_at: Callable[[jax.Array], Scene]
@@ -68,6 +69,7 @@ class Problem(NamedTuple):
     valid: jax.Array
     noise: np.ndarray
     solver: Newton
+    longest: jax.Array | None
 
 
 class Spent(NamedTuple):
@@ -155,10 +157,8 @@ def follow(
 ) -> tuple[Solution, Any, Trail]:
     """Equilibria of `scene_at(s)` at each of the targets, each started from the one before.
 
-    The first attempt goes straight to the first target. After a failed attempt the increment is halved, and the next
-    attempt starts from the newest accepted state. After an accepted one the increment is doubled. When no further
-    attempt is allowed (see `_judge`) the continuation ends: the remaining targets are reported `NOT_CONVERGED`, at the
-    newest accepted state.
+    The first attempt goes straight to the first target, if it may (see `longest_increment`). Others start from the newest
+    accepted state. When none is allowed any more (see `_judge`), the remaining targets are reported `NOT_CONVERGED`.
 
     Args:
         scene_at: function of the parameter `s` that returns the scene, with unlocked indices.
@@ -175,7 +175,8 @@ def follow(
     """
     valid = jax.vmap(lambda s: is_valid(scene_at(s)))(targets)
     noise = np.random.default_rng(0).standard_normal(trail.x[0].shape).astype(trail.x.dtype)
-    problem = Problem(scene_at, layout, targets, valid, noise, solver)
+    longest = longest_increment(*(scene_at(jnp.asarray(s, targets.dtype)) for s in (0, 1)))
+    problem = Problem(scene_at, layout, targets, valid, noise, solver, longest)
     begin = init(problem, trail, x, displacement)
     state = lax.while_loop(lambda state: state.running, partial(step, problem), begin)
     return _solutions(problem, state), state.factor, state.trail
@@ -186,16 +187,20 @@ def init(problem: Problem, trail: Trail, x: jax.Array | None, displacement: jax.
     targets, newest = problem.targets, trail.x[0]
     if displacement is None:
         displacement = jnp.where((trail.depth > 0) & (x is None), targets[0] * trail.slope[0], 0)
-    zero, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
+    zero, no, first = jnp.zeros((), jnp.int32), jnp.asarray(False), targets[0]
+    if problem.longest is not None:
+        # A start of the user's own is near the target, so it is tried there.
+        first = jnp.where(x is None or jnp.all(x == newest), jnp.minimum(first, problem.longest), first)
+        displacement = displacement * jnp.where(targets[0] > 0, first / targets[0], 1)
     return Continuation(
         target=zero,
         trail=trail,
         accepted=newest,
-        parameter=targets[0],
+        parameter=first,
         start=newest if x is None else x,
         displacement=displacement,
         factor=zero_factor(problem.layout, newest.dtype, problem.solver.linear),
-        increment=targets[0],
+        increment=first,
         cuts=zero,
         escapes=zero,
         spent=Spent(zero, zero, zero, zero, zero),
@@ -229,7 +234,7 @@ def step(problem: Problem, state: Continuation) -> Continuation:
         cuts=jnp.where(verdict.landed & (report.status == 0), 0, state.cuts + verdict.failed.astype(jnp.int32)),
         escapes=jnp.where(verdict.accepted, 0, state.escapes + verdict.saddle.astype(jnp.int32)),
         spent=jax.tree.map(lambda count: jnp.where(verdict.landed, 0, count), spent),
-        path=_write(state, report, verdict.landed | state.given_up),
+        path=write(state.path, state.target, report, verdict.landed | state.given_up),
         given_up=verdict.give_up,
         running=~state.given_up & ~(verdict.landed & (state.target == len(problem.targets) - 1)),
     )
@@ -347,13 +352,14 @@ def _next_parameter(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The index of the next target, the parameter of the next attempt, and the increment; each `()`.
 
-    An accepted attempt doubles the increment. A failed one leaves half the distance that it tried from the newest state
-    of `trail`. From a saddle the same parameter is tried again.
+    A failed attempt leaves half the distance that it tried. From a saddle the same parameter is tried again.
     """
     shorter = jnp.where(verdict.saddle, state.increment, 0.5 * (state.parameter - trail.s[0]))
     # If one attempt reached the target, the next target is tried in one attempt: the whole path has length 1.
     in_one = verdict.landed & ((report.attempts == 1) | (state.increment <= 0))
     increment = jnp.where(in_one, 1.0, jnp.where(verdict.accepted, 2 * state.increment, shorter)).astype(trail.x.dtype)
+    if problem.longest is not None:
+        increment = jnp.minimum(increment, problem.longest)
     target = jnp.minimum(state.target + verdict.landed.astype(jnp.int32), len(problem.targets) - 1)
     # Do not stop just short of the target: the increment left would be almost zero.
     to_target = verdict.give_up | (trail.s[0] + 1.01 * increment >= problem.targets[target])
@@ -378,12 +384,6 @@ def _next_start(
     escape = jnp.where(jnp.isfinite(scale), scale * attempt.response, 0)
     predicted = jnp.where(verdict.give_up, 0, predict(trail, parameter))
     return start, jnp.where(escaping, escape, predicted)
-
-
-def _write(state: Continuation, report: Report, final: jax.Array) -> PackedReport:
-    """The packed reports of all targets, with this report of the present one written if it is `final` `()`."""
-    write = lambda all, new: all.at[state.target].set(jnp.where(final, new, all[state.target]))
-    return jax.tree.map(write, state.path, pack(report))
 
 
 def _solutions(problem: Problem, state: Continuation) -> Solution:

@@ -70,3 +70,9 @@ def zeros(count: int, x: jax.Array) -> PackedReport:
         floats=jnp.zeros((count, len(FLOATS)), x.dtype),
         integers=jnp.zeros((count, len(INTEGERS)), jnp.int32),
     )
+
+
+def write(path: PackedReport, number: jax.Array, report: Report, final: jax.Array) -> PackedReport:
+    """The packed reports of all targets, with the one of target `number` `()` written if it is `final` `()`."""
+    put = lambda all, new: all.at[number].set(jnp.where(final, new, all[number]))
+    return jax.tree.map(put, path, pack(report))

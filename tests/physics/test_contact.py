@@ -147,6 +147,46 @@ def test_an_obstacle_that_is_moved(block):
         np.testing.assert_allclose(x, expected, atol=1e-8)
 
 
+def under(obstacle, nx=15):
+    """A cantilever under an obstacle that touches it near its tip."""
+    mesh = jb.rectangle(3.5, 0.8, nx, 5)
+    top, left, tip = (
+        jb.nodes_where(mesh, where)
+        for where in (lambda x, y: y > 0.3999, lambda x, y: x < -1.7499, lambda x, y: x > 1.7499)
+    )
+    terms = jb.solid(mesh, jb.lame(1e4, 0.45)), jb.contact(mesh, top, obstacle, 1e5, 1e-4)
+    return jb.Scene(mesh, terms, jb.clamped(mesh, left), tip)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "ways"),
+    [
+        (jb.disk([1.0, 0.7], 0.3), {-0.3: -6.0, -1.0: -20.0}),
+        (jb.box([1.0, 0.7], [0.5, 0.6]), {-0.3: -6.0, -0.7: -15.0}),
+    ],
+    ids=["disk", "box"],
+)
+def test_a_long_way_in_one_call(obstacle, ways):
+    """Moved by as much as its size, and by more than that, it pushes the beam down as in small steps. In one step the
+    beam would come out above it, or not see it at all."""
+    scene = under(obstacle)
+    for way, least in ways.items():
+        found = jb.check(jb.equilibrium(jb.command(scene, [way])))
+        path = jb.check(jb.ramp(scene, [way], 20))
+        np.testing.assert_allclose(found.x, path.x[-1], atol=1e-8)
+        assert float(jb.tip_angle(scene, found.x)) < least
+        assert float(jb.sweep(scene, np.array([[way]])).x[0, -1, 1]) == pytest.approx(float(found.x[-1, 1]), abs=1e-8)
+
+
+def test_the_wrong_side_is_told():
+    """Where the upper side of the beam lies beyond the centre of the disk, the disk would push it up."""
+    for way, wrong in ((-0.25, False), (-0.35, True)):
+        scene = jb.command(under(jb.disk([1.0, 0.7], 0.3)), [way])
+        assert (float(jb.smallest_jacobian(scene, scene.mesh.nodes)) < 0) == wrong
+    with pytest.raises(ValueError, match=r"x0: element .* is inverted"):
+        jb.equilibrium(scene, scene.mesh.nodes + 1e-9)
+
+
 def test_slope_in_the_radius():
     load = lambda r: (
         -jnp.sum(jb.contact_forces(s := jb.command(pressed(1e6, r[0]), [-0.02]), jb.equilibrium(s).x), axis=0)[1]
@@ -186,5 +226,7 @@ def test_bad_obstacles_are_refused():
         jb.half_plane([0.0, 0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match="stiffness: expected a positive"):
         jb.contact(mesh, below, jb.disk([0.0, -2.0], 1.0), -1.0, 1e-3)
+    with pytest.raises(ValueError, match=r"thickness is 0.04, less than the longest edge .* 0.438"):
+        jb.contact(mesh, below, jb.disk([0.0, -2.0], 0.02), 1.0, 1e-3)
     with pytest.raises(ValueError, match="at least one edge of the surface"):
         jb.contact(mesh, [4], jb.disk([0.0, -2.0], 1.0), 1.0, 1e-3)
