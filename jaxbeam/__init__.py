@@ -47,6 +47,7 @@ from jaxbeam.scene.beams import tendon_beam as tendon_beam
 from jaxbeam.scene.measures import cauchy_stress as cauchy_stress
 from jaxbeam.scene.measures import contact_forces as contact_forces
 from jaxbeam.scene.measures import contact_pressures as contact_pressures
+from jaxbeam.scene.measures import guide_forces as guide_forces
 from jaxbeam.scene.measures import jacobians as jacobians
 from jaxbeam.scene.measures import nodal_stress as nodal_stress
 from jaxbeam.scene.measures import penetration as penetration

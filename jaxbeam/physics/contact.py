@@ -220,7 +220,8 @@ def contact(
     Args:
         mesh: of triangles; differentiable in its nodes.
         nodes: `(m,)` node numbers. The edges of the surface of which both corners are among them may touch it.
-        obstacle: `half_plane(...)`, `disk(...)`, `box(...)`, or an `Obstacle` with a distance of your own.
+        obstacle: `half_plane(...)`, `disk(...)`, `box(...)`, or an `Obstacle` with a distance of your own. Without a
+            `stride` one of your own must be moved in small steps: moved far in one call, it may end up inside the body.
         stiffness: pressure per depth (force per volume, thickness 1), positive; differentiable. The body sinks in by
             about the pressure over the stiffness.
         transition: depth over which the pressure sets in, a length, positive; differentiable.

@@ -106,7 +106,15 @@ class LineEnergy(Energy):
         return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
-        return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
+        def on_points(x: jax.Array, params: Any) -> jax.Array:
+            points = self.points(from_first(x), params.attachment)
+            return -self.tension(x, params) * jax.grad(polyline_length)(points)
+
+        return {
+            "length": jax.vmap(self.length)(x, params),
+            "tension": jax.vmap(self.tension)(x, params),
+            "guide_force": jax.vmap(on_points)(x, params),
+        }
 
     def line(self, x: jax.Array, params: Any) -> jax.Array:
         return jax.vmap(self.points)(x, params.attachment)[..., :2]

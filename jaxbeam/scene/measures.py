@@ -88,6 +88,19 @@ def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 @one_program
+def guide_forces(scene: Scene, x: jax.Array) -> list[jax.Array]:
+    """Forces of tendons and cables on the body at each of their points: their ends and guides.
+
+    Returns:
+        For each term of tendons or cables `(m, p, 2)`. Those of one tendon balance. A row that was given with fewer
+        points than others ends in zeros, after its last end.
+    """
+    x = placed(scene, x)
+    found = [term.kind.measured(x[term.nodes], term.params) for term in scene.terms]
+    return [each["guide_force"] for each in found if "guide_force" in each]
+
+
+@one_program
 def contact_forces(scene: Scene, x: jax.Array) -> jax.Array:
     """Force of the obstacle on each edge that may touch one, `(m, 2)`, over all terms of contact."""
     return _measured(scene, x, "contact_force", (2,))

@@ -157,8 +157,8 @@ def follow(
 ) -> tuple[Solution, Any, Trail]:
     """Equilibria of `scene_at(s)` at each of the targets, each started from the one before.
 
-    The first attempt goes straight to the first target, if it may (see `longest_increment`). Others start from the newest
-    accepted state. When none is allowed any more (see `_judge`), the remaining targets are reported `NOT_CONVERGED`.
+    The first attempt goes straight to the first target, if it may (see `longest_increment`). Others start from the
+    newest accepted state. When none is allowed any more (see `_judge`), the other targets are `NOT_CONVERGED`.
 
     Args:
         scene_at: function of the parameter `s` that returns the scene, with unlocked indices.

@@ -105,3 +105,27 @@ def test_a_cable_through_guides_on_its_way_is_the_straight_one():
     x = np.asarray(BEAM.mesh.nodes) @ (1.3 * turn.T)
     lengths = [float(jb.tendon_lengths(with_terms(term), x)[0]) for term in (straight, guided)]
     np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-13)
+
+
+def test_forces_on_guides():
+    """They balance, and turn a line of one tension: at an end it is the tension, at a guide the sum of two pulls."""
+    scene = jb.command(with_terms(jb.tendons(BEAM.mesh, GUIDES, 2e3)), [0.8, 0.9, 0.95])
+    found = jb.check(jb.equilibrium(scene))
+    (forces,), tension = jb.guide_forces(scene, found.x), np.asarray(jb.tendon_tensions(scene, found.x))
+    assert forces.shape == (3, 4, 2)
+    np.testing.assert_allclose(np.sum(forces, axis=1), 0, atol=1e-11)
+    for line, row, pull in zip(GUIDES, np.asarray(forces), tension, strict=True):
+        points = np.asarray(found.x)[line]
+        units = np.diff(points, axis=0)
+        units = pull * units / np.linalg.norm(units, axis=1, keepdims=True)
+        expected = np.zeros((4, 2))
+        expected[: len(line)] = np.concatenate([units, np.zeros((1, 2))]) - np.concatenate([np.zeros((1, 2)), units])
+        np.testing.assert_allclose(row, expected, atol=1e-10 * pull)
+    # They are what the tendons do to the nodes.
+    total = np.zeros(found.x.shape)
+    for line, row in zip(GUIDES, np.asarray(forces), strict=True):
+        np.add.at(total, line, row[: len(line)])
+    tendons = scene.terms[1]
+    other = np.zeros(found.x.shape)
+    np.add.at(other, tendons.nodes, -np.asarray(tendons.kind.gradients(found.x[tendons.nodes], tendons.params)[1]))
+    np.testing.assert_allclose(total, other, atol=1e-10)
