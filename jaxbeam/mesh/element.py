@@ -172,6 +172,12 @@ def edge_functions(nodes: int, xi: np.ndarray) -> np.ndarray:
     return np.stack([(1 - xi) * (1 - 2 * xi), xi * (2 * xi - 1), 4 * xi * (1 - xi)], axis=-1)
 
 
+def edge_rule(points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss's rule on (0, 1): points and weights `(points,)`."""
+    xi, weights = np.polynomial.legendre.leggauss(points)
+    return (1 + xi) / 2, weights / 2
+
+
 def edge_slopes(nodes: int, xi: np.ndarray) -> np.ndarray:
     """Slopes `(..., nodes)` of the `edge_functions` in `xi`."""
     if nodes == 2:

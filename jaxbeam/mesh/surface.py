@@ -23,12 +23,12 @@ from functools import lru_cache
 import numpy as np
 
 from jaxbeam.core.tree import Key, is_concrete, key_of, read_only
-from jaxbeam.mesh.element import edge_functions
+from jaxbeam.mesh.element import edge_functions, edge_rule
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
 
 # Gauss's rule of three points on (0, 1): exact for a shape function times the weights, on a straight edge.
-_POINTS, _SHARES = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, np.polynomial.legendre.leggauss(3)[1] / 2
+_POINTS, _SHARES = edge_rule(3)
 # Cosine of the turn from one edge to the next, here 45 degrees, at which a patch ends: a corner of the body.
 CORNER = 0.7
 # Variances of the patch below this share of the largest are those of a gentle bend, along which the mean is not moved.

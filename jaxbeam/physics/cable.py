@@ -2,10 +2,10 @@
 
 With the length `l`, the commanded length `l*` and the stretch `s = l - l*` of a cable, the energy is
 
-    k w^2 h(s / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1).
+    k w^2 h(s / w)
 
-Over the transition width `w` the stiffness rises linearly from 0 to `k`. Energy, tension and stiffness are continuous,
-as Newton's method needs.
+with the one-sided law `h` of `jaxbeam.physics.one_sided`. Over the transition width `w` the stiffness rises linearly
+from 0 to `k`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.physics.energy import Term
+from jaxbeam.physics.one_sided import one_sided, one_sided_slope
 from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, tendons
 
 
@@ -43,16 +44,13 @@ class CableEnergy(TendonEnergy):
     name: ClassVar[str] = "cable"
 
     def __call__(self, x: jax.Array, params: Any) -> jax.Array:
-        t = self._stretch(x, params)
-        rising, taut = jnp.clip(t, 0, 1), jnp.maximum(t, 1)
-        shape = jnp.where(t < 1, rising**3 / 6, 0.5 * (taut - 0.5) ** 2 + 1 / 24)
-        return self.stiffness(params.modulus, params.commanded) * params.transition**2 * shape
+        stiffness = self.stiffness(params.modulus, params.commanded)
+        return stiffness * params.transition**2 * one_sided(self._stretch(x, params))
 
     def tension(self, x: jax.Array, params: Any) -> jax.Array:
         """`dE/dl` `()`: zero when slack, else positive."""
-        t = self._stretch(x, params)
-        shape = jnp.where(t < 1, 0.5 * jnp.clip(t, 0, 1) ** 2, jnp.maximum(t, 1) - 0.5)
-        return self.stiffness(params.modulus, params.commanded) * params.transition * shape
+        stiffness = self.stiffness(params.modulus, params.commanded)
+        return stiffness * params.transition * one_sided_slope(self._stretch(x, params))
 
     def _stretch(self, x: jax.Array, params: Any) -> jax.Array:
         """Stretch beyond the commanded length, relative to the transition width: `s / w` `()`."""

@@ -3,10 +3,12 @@
 An obstacle is a function of a point that is its distance from the obstacle, negative inside. Where the surface of the
 body is at the distance `g`, the obstacle pushes with the pressure
 
-    p = k w h'(-g / w),     h(t) = 0 (t <= 0),   t^3 / 6 (0 < t < 1),   (t - 1/2)^2 / 2 + 1/24 (t >= 1).
+    p = k w h'(-g / w)
 
-It is zero outside, and deep inside it grows by the stiffness `k` with each unit of depth. Over the transition width `w`
-it sets in smoothly, as Newton's method needs. Its potential is `k w^2 h(-g / w)` on each length of the surface at rest.
+with the one-sided law `h` of `jaxbeam.physics.one_sided`. It is zero outside, and deep inside it grows by the stiffness
+`k` with each unit of depth. Over the transition width `w` it sets in smoothly. Its potential is `k w^2 h(-g / w)` on
+each length of the surface at rest.
+
 This is the penalty method (Wriggers, "Computational Contact Mechanics", 2006, section 6.3): the surface sinks in by
 about `p / k`, a depth that falls as one over the stiffness.
 
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -26,13 +29,15 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
-from jaxbeam.mesh.element import edge_functions, edge_slopes
+from jaxbeam.mesh.element import edge_functions, edge_rule, edge_slopes
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
+from jaxbeam.physics.one_sided import one_sided, one_sided_slope
+from jaxbeam.physics.quadrature import edge_lengths
 
-# Gauss's rule of three points on each edge.
-_XI, _SHARES = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, np.polynomial.legendre.leggauss(3)[1] / 2
+# Quadrature points of each edge.
+POINTS = 3
 
 Distance = Callable[[jax.Array, Any], jax.Array]
 
@@ -140,24 +145,21 @@ class ContactEnergy(Energy):
     command_hint: ClassVar[str] = "it is how far the obstacle is moved along its direction"
 
     def __call__(self, x: jax.Array, params: ContactParams) -> jax.Array:
-        t = self._depths(x, params)
-        rising, deep = jnp.clip(t, 0, 1), jnp.maximum(t, 1)
-        shape = jnp.where(t < 1, rising**3 / 6, 0.5 * (deep - 0.5) ** 2 + 1 / 24)
+        shape = one_sided(-self.gaps(x, params) / params.transition)
         return params.stiffness * params.transition**2 * jnp.sum(params.lengths * shape)
 
     def gaps(self, x: jax.Array, params: ContactParams) -> jax.Array:
         """Distance of the edge from the obstacle at its quadrature points, `(q,)`."""
-        points = jnp.asarray(edge_functions(len(x), _XI), x.dtype) @ x - params.moved * params.direction
-        return jax.vmap(self.distance, in_axes=(0, None))(points, params.shape)
+        return jax.vmap(self.distance, in_axes=(0, None))(self._points(x, params), params.shape)
 
     def pressures(self, x: jax.Array, params: ContactParams) -> jax.Array:
         """Pressure at the quadrature points of the edge, `(q,)`."""
-        t = self._depths(x, params)
-        shape = jnp.where(t < 1, 0.5 * jnp.clip(t, 0, 1) ** 2, jnp.maximum(t, 1) - 0.5)
-        return params.stiffness * params.transition * shape
+        return params.stiffness * params.transition * one_sided_slope(-self.gaps(x, params) / params.transition)
 
-    def _depths(self, x: jax.Array, params: ContactParams) -> jax.Array:
-        return -self.gaps(x, params) / params.transition
+    def _points(self, x: jax.Array, params: ContactParams) -> jax.Array:
+        """The quadrature points `(q, 2)`, as seen from the obstacle before it was moved."""
+        xi, _ = edge_rule(POINTS)
+        return jnp.asarray(edge_functions(len(x), xi), x.dtype) @ x - params.moved * params.direction
 
     def command(self, params: ContactParams, values: jax.Array) -> ContactParams:
         xp = namespace(values)
@@ -180,10 +182,10 @@ class ContactEnergy(Energy):
         """Negative where the surface has come out on the other side of the obstacle, which is then inside the body."""
 
         def of_edge(x: jax.Array, params: ContactParams) -> jax.Array:
-            along = jnp.asarray(edge_slopes(len(x), _XI), x.dtype) @ x
+            along = jnp.asarray(edge_slopes(len(x), edge_rule(POINTS)[0]), x.dtype) @ x
             outward = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
-            points = jnp.asarray(edge_functions(len(x), _XI), x.dtype) @ x - params.moved * params.direction
-            gaps, away = jax.vmap(jax.value_and_grad(self.distance), in_axes=(0, None))(points, params.shape)
+            both = jax.vmap(jax.value_and_grad(self.distance), in_axes=(0, None))
+            gaps, away = both(self._points(x, params), params.shape)
             facing = jnp.sum(outward * away, axis=1) / jnp.linalg.norm(outward, axis=1)
             return jnp.min(jnp.where((gaps < 0) & (facing > 0), -facing, jnp.inf))
 
@@ -195,7 +197,7 @@ class ContactEnergy(Energy):
     def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
         params = jax.tree.map(lambda leaf: np.asarray(leaf)[parents], term.params)
-        return Term(self, edges, replace(params, lengths=_lengths(mesh, edges)))
+        return Term(self, edges, replace(params, lengths=edge_lengths(mesh.nodes, edges, POINTS)))
 
     def measured(self, x: jax.Array, params: ContactParams) -> dict[str, jax.Array]:
         gaps = jax.vmap(self.gaps)(x, params)
@@ -244,7 +246,7 @@ def contact(
     )
     params = ContactParams(
         shape=jax.tree.map(every, obstacle.params),
-        lengths=_lengths(mesh, edges),
+        lengths=edge_lengths(mesh.nodes, edges, POINTS),
         stiffness=every(numbers[0]),
         transition=every(numbers[1]),
         moved=every(0.0),
@@ -256,11 +258,17 @@ def contact(
     return term
 
 
+@partial(jax.jit, static_argnums=0)
+def _gaps(energy: ContactEnergy, x: jax.Array, params: ContactParams) -> jax.Array:
+    """Distances `(m, q)` of edges at `x` `(m, k, 2)` from the obstacle."""
+    return jax.vmap(energy.gaps)(x, params)
+
+
 def _check_outside(mesh: Mesh, term: Term) -> None:
     """Refuse an obstacle that holds part of the surface inside at rest, or is thinner than an edge is long."""
     if not is_concrete(mesh.nodes, *jax.tree.leaves(term.params)):
         return
-    gaps = np.asarray(jax.jit(jax.vmap(term.energy.gaps))(np.asarray(mesh.nodes)[term.nodes], term.params))  # type: ignore[attr-defined]
+    gaps = np.asarray(_gaps(term.energy, np.asarray(mesh.nodes)[term.nodes], term.params))
     # A surface that lies on the obstacle touches it up to round-off.
     size = np.ptp(np.asarray(mesh.nodes), axis=0).max()
     if gaps.min() < -1e-6 * size:
@@ -275,11 +283,3 @@ def _check_outside(mesh: Mesh, term: Term) -> None:
             f"obstacle: its thickness is {4 * float(stride[0]):.3g}, less than the longest edge that may touch it, "
             f"{longest:.3g}, between whose points it could pass; refine the mesh there"
         )
-
-
-def _lengths(mesh: Mesh, edges: np.ndarray) -> Any:
-    """Length at rest of the part of each quadrature point of edges `(m, k)`, `(m, q)`."""
-    xp, dtype = namespace(mesh.nodes), mesh.nodes.dtype
-    rest = xp.asarray(mesh.nodes)[edges]
-    along = xp.einsum("qk,mkd->mqd", xp.asarray(edge_slopes(edges.shape[1], _XI), dtype), rest - rest[:, :1])
-    return xp.sqrt(xp.sum(along**2, axis=2)) * xp.asarray(_SHARES, dtype)

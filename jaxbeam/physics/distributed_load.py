@@ -20,15 +20,15 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
-from jaxbeam.mesh.element import edge_functions, edge_slopes
+from jaxbeam.mesh.element import edge_functions, edge_rule
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
-from jaxbeam.physics.quadrature import mapped
+from jaxbeam.physics.quadrature import edge_lengths, mapped
 
-# Gauss's rule on (0, 1) for edges. On a curved edge the element of length is no polynomial.
-_XI, _SHARES = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2, np.polynomial.legendre.leggauss(5)[1] / 2
+# Quadrature points of each edge. On a curved edge the element of length is no polynomial.
+POINTS = 5
 
 
 @pytree
@@ -116,11 +116,10 @@ def traction(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
 
 def _on_edges(mesh: Mesh, edges: np.ndarray, force: Any) -> Term:
     """Traction on edges `(m, k)`; `force` is `(2,)` or `(m, 2)`."""
-    xp, dtype, count = namespace(mesh.nodes), mesh.nodes.dtype, edges.shape[1]
+    xp, dtype = namespace(mesh.nodes), mesh.nodes.dtype
+    functions = edge_functions(edges.shape[1], edge_rule(POINTS)[0])
+    shares = edge_lengths(mesh.nodes, edges, POINTS) @ xp.asarray(functions, dtype)
     rest = xp.asarray(mesh.nodes)[edges]
-    along = xp.einsum("qk,mkd->mqd", xp.asarray(edge_slopes(count, _XI), dtype), rest - rest[:, :1])
-    length = xp.sqrt(xp.sum(along**2, axis=2))
-    shares = (length * xp.asarray(_SHARES, dtype)) @ xp.asarray(edge_functions(count, _XI), dtype)
     return Term(TractionEnergy(), edges, DistributedParams(rest, shares, _rows(force, len(edges), dtype)))
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.tree import namespace, pytree
+from jaxbeam.mesh.element import edge_rule, edge_slopes
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.projection import project_many
 
@@ -67,6 +68,14 @@ def mapped(nodes: Any, elements: np.ndarray, degree: int) -> tuple[Any, Any, Any
     inverse = inverse.reshape(map_.shape) / determinant[..., None, None]
     gradients = xp.einsum("qki,mqid->mqkd", slopes, inverse)
     return rest, gradients, element.area * xp.asarray(shares, nodes.dtype) * determinant
+
+
+def edge_lengths(nodes: Any, edges: np.ndarray, points: int) -> Any:
+    """Weights times length at rest `(m, q)`, by `edge_rule(points)`, of edges `(m, k)`. Differentiable in the nodes."""
+    xp = namespace(nodes)
+    (xi, shares), rest = edge_rule(points), xp.asarray(nodes)[edges]
+    along = xp.einsum("qk,mkd->mqd", xp.asarray(edge_slopes(edges.shape[1], xi), nodes.dtype), rest - rest[:, :1])
+    return xp.sqrt(xp.sum(along**2, axis=2)) * xp.asarray(shares, nodes.dtype)
 
 
 def energies_and_gradients(density: Density, x: jax.Array, params: SolidParams) -> tuple[jax.Array, jax.Array]:
