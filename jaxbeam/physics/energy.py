@@ -141,6 +141,10 @@ class Energy:
         """Points `(m, p, 2)` of a line to draw for each stencil, in a colour of its own; None: it is not drawn."""
         return None
 
+    def line_forces(self, x: jax.Array, params: Any) -> jax.Array | None:
+        """Forces `(m, p, 2)` on the body at the points of the line; None if it has no line that pulls."""
+        return None
+
     def arms(self, x: jax.Array, params: Any) -> jax.Array | None:
         """Segments `(m, p, 2, 2)` to draw from the body to points of `line` that are not nodes; None: none."""
         return None

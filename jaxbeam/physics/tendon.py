@@ -106,15 +106,14 @@ class LineEnergy(Energy):
         return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
-        def on_points(x: jax.Array, params: Any) -> jax.Array:
+        return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}
+
+    def line_forces(self, x: jax.Array, params: Any) -> jax.Array:
+        def of_one(x: jax.Array, params: Any) -> jax.Array:
             points = self.points(from_first(x), params.attachment)
             return -self.tension(x, params) * jax.grad(polyline_length)(points)
 
-        return {
-            "length": jax.vmap(self.length)(x, params),
-            "tension": jax.vmap(self.tension)(x, params),
-            "guide_force": jax.vmap(on_points)(x, params),
-        }
+        return jax.vmap(of_one)(x, params)
 
     def line(self, x: jax.Array, params: Any) -> jax.Array:
         return jax.vmap(self.points)(x, params.attachment)[..., :2]

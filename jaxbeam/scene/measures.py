@@ -96,8 +96,8 @@ def guide_forces(scene: Scene, x: jax.Array) -> list[jax.Array]:
         points than others ends in zeros, after its last end.
     """
     x = placed(scene, x)
-    found = [term.kind.measured(x[term.nodes], term.params) for term in scene.terms]
-    return [each["guide_force"] for each in found if "guide_force" in each]
+    found = [term.kind.line_forces(x[term.nodes], term.params) for term in scene.terms]
+    return [forces for forces in found if forces is not None]
 
 
 @one_program
