@@ -65,33 +65,9 @@ def trace(scene: jb.Scene, **start: Any) -> jb.Branch:
 
 def trace_pair(scene: jb.Scene, fork: jb.Critical) -> list[jb.Branch]:
     """The two bent branches of a bifurcation, each from the bifurcation on."""
-    traced = []
-    for side in (1, -1):
-        # A little beyond the bifurcation, pushed off along its mode, lies a state of the branch.
-        s = fork.parameter + 0.003
-        ratios = 1 + s * (np.array(END) - 1)
-        beside = jb.equilibrium(jb.command(scene, ratios), fork.x + side * 0.02 * fork.shape, SOLVER)
-        jb.check(beside)
-        start: dict[str, Any] = {"x0": beside.x, "parameter": s, "interval": (0.5, 1.0)}
-        onward = trace(scene, **start, step=0.01, max_points=80)
-        back = trace(scene, **start, direction=-1, step=0.0006, max_points=60)
-        traced.append(join(scene, fork, back, onward))
-    return traced
-
-
-def join(scene: jb.Scene, fork: jb.Critical, back: jb.Branch, onward: jb.Branch) -> jb.Branch:
-    """One branch that begins at the bifurcation: `back` turned round, up to where it reaches it, and `onward`."""
-    angles = np.array([float(jb.tip_angle(scene, jnp.asarray(x))) for x in back.x])
-    count = int(np.argmax(angles * np.sign(angles[0]) < 0)) or len(angles)
-    first = {"parameter": fork.parameter, "ratios": fork.ratios, "x": fork.x, "negative": 1, "residual": 0.0}
-    first |= {"smallest_jacobian": float(jb.smallest_jacobian(scene, fork.x)), "overlapping": False}
-    parts: dict[str, Any] = {
-        name: np.concatenate([np.asarray(value)[None], getattr(back, name)[1:count][::-1], getattr(onward, name)])
-        for name, value in first.items()
-    }
-    turned = [dataclasses.replace(c, after=count - 1 - c.after) for c in back.critical if c.after < count - 1]
-    further = [dataclasses.replace(c, after=count + c.after) for c in onward.critical]
-    return dataclasses.replace(onward, **parts, critical=(*turned[::-1], *further))
+    return [
+        trace(scene, through=fork, direction=side, interval=(0.5, 1.0), step=0.01, max_points=140) for side in (1, -1)
+    ]
 
 
 def pull(scene: jb.Scene) -> tuple[np.ndarray, np.ndarray]:

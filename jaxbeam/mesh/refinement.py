@@ -11,6 +11,7 @@ from jaxbeam.core.tree import namespace
 from jaxbeam.mesh.element import Element
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.surface import surface
 
 
 @usual_rules
@@ -50,18 +51,36 @@ class Finer(NamedTuple):
     Displacements are carried to the finer mesh in the same way as positions.
 
     elements: node numbers of the elements of the finer mesh.
+    parts: number of them for each coarse element.
     nodes: `(n, k)` for each of the `n` finer nodes, numbers of coarse nodes.
     weights: `(n, k)` their weights in the mean.
     """
 
     elements: np.ndarray
+    parts: int
     nodes: np.ndarray
     weights: np.ndarray
+
+    @property
+    def coarse(self) -> int:
+        """Number of coarse nodes. They are the first of the finer ones."""
+        return int(self.nodes.max()) + 1
 
     def carry(self, field: Any) -> Any:
         """A nodal field of the coarse mesh, with `d` values at a node, on the finer mesh: `(n, d)`."""
         xp = namespace(field)
         return xp.sum(self.weights[:, :, None].astype(field.dtype) * xp.asarray(field)[self.nodes], axis=1)
+
+
+def heirs(finer: Finer, mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Nodes of the finer `mesh` that inherit a role of coarse `nodes` `(m,)`: these, and new ones between them.
+
+    A new node inherits if it lies on the surface. Inside, an edge may join two clamps, and its middle is free.
+    """
+    every = np.isin(finer.nodes, nodes) | (finer.weights == 0)
+    outside = np.isin(np.arange(len(finer.nodes)), surface(mesh))
+    old = np.arange(len(finer.nodes)) < finer.coarse
+    return np.flatnonzero(every.all(axis=1) & (outside | old))
 
 
 def cut_elements(elements: np.ndarray, count: int) -> Finer:
@@ -105,7 +124,7 @@ def _divided(elements: np.ndarray, count: int, target: Element, parts: np.ndarra
     nodes = np.concatenate([np.repeat(np.arange(count)[:, None], old.nodes, axis=1), elements[first // new]])
     own = np.tile(np.eye(1, old.nodes), (count, 1))
     weights = np.concatenate([own, old.shape(places[~known])[first % new]])
-    return Finer(whole.reshape(-1, target.nodes), nodes, weights)
+    return Finer(whole.reshape(-1, target.nodes), len(parts), nodes, weights)
 
 
 def _finer_mesh(mesh: Mesh, finer: Finer) -> Mesh:

@@ -22,6 +22,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Term
 from jaxbeam.physics.one_sided import one_sided, one_sided_slope
 from jaxbeam.physics.tendon import TendonEnergy, TendonParams, inverse_square_stiffness, tendons
@@ -59,9 +60,9 @@ class CableEnergy(TendonEnergy):
     def valid(self, params: Any) -> jax.Array:
         return super().valid(params) & jnp.all(params.transition > 0)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
-        finer = super().refined(term, mesh, parts)
-        return finer if finer is term else _as_cables(finer, self.stiffness, term.params.transition)
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
+        same = super().refined(term, mesh, finer)
+        return same if same is term else _as_cables(same, self.stiffness, term.params.transition)
 
 
 @usual_rules
@@ -72,6 +73,7 @@ def cables(
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
     width: Numbers = 0.0,
     transition: Numbers = 0.01,
+    shared: bool = False,
 ) -> Term:
     """Tendons that only pull, at their natural length (ratio 1); `command` shortens them.
 
@@ -83,11 +85,12 @@ def cables(
         width: as for `tendons`.
         transition: stretch over which a slack cable becomes taut, relative to the natural length, positive; scalar or
             `(m,)`; differentiable. If it is small, the stiffness changes sharply, which is hard for Newton's method.
+        shared: as for `tendons`.
 
     Raises:
         ValueError: as `tendons` does, or if a transition is not positive and finite.
     """
-    term = tendons(mesh, nodes, modulus, stiffness, width)
+    term = tendons(mesh, nodes, modulus, stiffness, width, shared)
     shares = checks.numbers("transition", transition, checks.POSITIVE, ((), (len(term.nodes),)), "one for each cable")
     natural = term.params.natural
     xp = namespace(shares, natural)
@@ -97,5 +100,5 @@ def cables(
 def _as_cables(term: Term, stiffness: Callable[[jax.Array, jax.Array], jax.Array], transition: Any) -> Term:
     """A term of cables with the nodes and parameters of two-way tendons. `transition` `(m,)` is a length."""
     shared = {field.name: getattr(term.params, field.name) for field in dataclasses.fields(TendonParams)}
-    energy = CableEnergy(stiffness, term.kind.points)  # type: ignore[attr-defined]
+    energy = CableEnergy(stiffness, term.kind.points, term.kind.shared_command)  # type: ignore[attr-defined]
     return Term(energy, np.asarray(term.nodes), CableParams(**shared, transition=transition))

@@ -31,6 +31,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
 from jaxbeam.mesh.element import edge_functions, edge_rule, edge_slopes
 from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 from jaxbeam.physics.one_sided import one_sided, one_sided_slope
@@ -141,7 +142,7 @@ class ContactEnergy(Energy):
     name: ClassVar[str] = "contact"
     coordinates: ClassVar[int | None] = 2
     rest_command: ClassVar[float | None] = 0.0
-    shared_command: ClassVar[bool] = True
+    shared_command = True
     command_hint: ClassVar[str] = "it is how far the obstacle is moved along its direction"
 
     def __call__(self, x: jax.Array, params: ContactParams) -> jax.Array:
@@ -194,7 +195,7 @@ class ContactEnergy(Energy):
     def valid(self, params: ContactParams) -> jax.Array:
         return jnp.all((params.stiffness > 0) & (params.transition > 0))
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
         params = jax.tree.map(lambda leaf: np.asarray(leaf)[parents], term.params)
         return Term(self, edges, replace(params, lengths=edge_lengths(mesh.nodes, edges, POINTS)))

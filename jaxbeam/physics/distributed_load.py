@@ -23,6 +23,7 @@ from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.element import edge_functions, edge_rule
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 from jaxbeam.physics.quadrature import edge_lengths, mapped
@@ -58,8 +59,8 @@ class WeightEnergy(Energy):
     def partway(self, params: DistributedParams, share: jax.Array) -> DistributedParams:
         return replace(params, force=share * params.force)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
-        return weight(mesh, np.repeat(np.asarray(term.params.force), parts, axis=0))
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
+        return weight(mesh, np.repeat(np.asarray(term.params.force), finer.parts, axis=0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +69,7 @@ class TractionEnergy(WeightEnergy):
 
     name: ClassVar[str] = "traction"
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
         return _on_edges(mesh, edges, np.asarray(term.params.force)[parents])
 

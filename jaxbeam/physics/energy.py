@@ -23,6 +23,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, pytree, read_only, static_field, to_device
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.projection import project_each
 
 
@@ -42,9 +43,10 @@ class Energy:
     name: ClassVar[str] = "term"  # word for a stencil in pictures and messages
     body: ClassVar[bool] = False  # elastic material: the energy is a strain energy, unchanged by rigid motions
     fills: ClassVar[bool] = False  # the stencils are elements of area, whose outer edges are the surface of the body
+    holds: tuple[bool, ...] = ()  # coordinates of its nodes that a support holds, `(d,)`; none of any other energy
     coordinates: ClassVar[int | None] = None  # number `d` that a node must have: 2, or 3 on a rod; None: any
     rest_command: ClassVar[float | None] = None  # command at which the term does nothing; None: it has no command
-    shared_command: ClassVar[bool] = False  # all stencils of a term share one command, instead of one for each
+    shared_command: bool = False  # all stencils of a term share one command, instead of one for each
     commands: ClassVar[checks.Range] = checks.FINITE  # range of the commands
     command_unit: ClassVar[float | None] = None  # unit for changes of the command; None: the width of its bounds
     command_hint: ClassVar[str] = ""  # meaning of a command, for the message about a command out of range
@@ -82,6 +84,10 @@ class Energy:
             return params
         return self.command(params, (1 - share) * self.rest_command + share * self.command_of(params))
 
+    def displacements(self, params: Any) -> jax.Array:
+        """Displacements `(m, k, d)` that a support prescribes; zero for coordinates that it does not hold."""
+        raise NotImplementedError
+
     def stride(self, params: Any) -> jax.Array | None:
         """The largest change of a command, `()`, from one solved state to the next; None: any."""
         return None
@@ -106,13 +112,13 @@ class Energy:
 
     # ------------------------------------------------------------------------------------- refinement
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         """The term on a finer mesh, on which nodes keep their numbers.
 
         Args:
             term: the term to carry over.
             mesh: the finer mesh.
-            parts: number of its elements for each element of the present mesh.
+            finer: how its elements and nodes come from those of the present mesh.
 
         Raises:
             NotRefinable: if the energy does not define it. A scene with such a term has no error bar.

@@ -12,6 +12,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 
 
@@ -39,7 +40,7 @@ class DeadLoadEnergy(Energy):
     def partway(self, params: PointParams, share: jax.Array) -> PointParams:
         return replace(params, value=share * params.value)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         return term
 
 

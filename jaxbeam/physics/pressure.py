@@ -24,6 +24,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.element import edge_products
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 
@@ -47,7 +48,7 @@ class PressureEnergy(Energy):
     name: ClassVar[str] = "pressure"
     coordinates: ClassVar[int | None] = 2
     rest_command: ClassVar[float | None] = 0.0
-    shared_command: ClassVar[bool] = True
+    shared_command = True
     command_hint: ClassVar[str] = "a pressure pushes on the body, and a negative one pulls"
 
     def __call__(self, x: jax.Array, params: PressureParams) -> jax.Array:
@@ -84,7 +85,7 @@ class PressureEnergy(Energy):
             f"nodes whose edges close a loop, or end at clamped nodes"
         )
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, _ = finer_edges(mesh, term.nodes)
         count = len(edges)
         centre = jnp.broadcast_to(term.params.centre[0], (count, 2))

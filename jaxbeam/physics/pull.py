@@ -18,6 +18,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, index_field, namespace, pytree, replace, to_device
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Term
 from jaxbeam.physics.tendon import LineEnergy, tendons
 
@@ -37,6 +38,7 @@ class PullEnergy(LineEnergy):
     """Energy `T l` of one cable. Its command is the tension `T`."""
 
     points: Callable[[jax.Array, Any], jax.Array]
+    shared_command: bool = False
     name: ClassVar[str] = "cable"
     rest_command: ClassVar[float | None] = 0.0
     commands: ClassVar[checks.Range] = checks.NOT_NEGATIVE
@@ -49,21 +51,26 @@ class PullEnergy(LineEnergy):
         return params.tension
 
     def command(self, params: PullParams, values: jax.Array) -> PullParams:
-        return replace(params, tension=to_device(namespace(values).asarray(values, params.tension.dtype)))
+        xp = namespace(values)
+        tension = xp.broadcast_to(xp.asarray(values, params.tension.dtype), params.tension.shape)
+        return replace(params, tension=to_device(tension))
 
     def command_of(self, params: PullParams) -> jax.Array:
-        return params.tension
+        return params.tension[:1] if self.shared_command else params.tension
 
     def valid(self, params: PullParams) -> jax.Array:
         return jnp.all(params.tension >= 0)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         params = term.params
-        return term if params.width is None else pulls(mesh, params.ends, params.tension, np.asarray(params.width))
+        if params.width is None:
+            return term
+        tension = params.tension[0] if self.shared_command else params.tension
+        return pulls(mesh, params.ends, tension, np.asarray(params.width), self.shared_command)
 
 
 @usual_rules
-def pulls(mesh: Mesh, nodes: Numbers, tension: Numbers = 0.0, width: Numbers = 0.0) -> Term:
+def pulls(mesh: Mesh, nodes: Numbers, tension: Numbers = 0.0, width: Numbers = 0.0, shared: bool = False) -> Term:
     """Cables under a tension that `command` sets, without tension at rest. They mix with tendons of any kind.
 
     Args:
@@ -71,13 +78,15 @@ def pulls(mesh: Mesh, nodes: Numbers, tension: Numbers = 0.0, width: Numbers = 0
         nodes: as for `tendons`.
         tension: force, not negative; scalar or `(m,)`; differentiable.
         width: as for `tendons`.
+        shared: whether one tension commands all of them, such as that of one motor; then give one `tension`.
 
     Raises:
         ValueError: as `tendons` does, or if a tension is negative or not finite.
     """
-    like = tendons(mesh, nodes, 1.0, width=width)
-    tension = checks.numbers("tension", tension, checks.NOT_NEGATIVE, ((), (len(like.nodes),)), "one for each cable")
+    like = tendons(mesh, nodes, 1.0, width=width, shared=shared)
+    shapes, meaning = (((),), "one for all") if shared else (((), (len(like.nodes),)), "one for each cable")
+    tension = checks.numbers("tension", tension, checks.NOT_NEGATIVE, shapes, meaning)
     xp = namespace(tension)
     values = xp.broadcast_to(xp.asarray(tension, mesh.nodes.dtype), (len(like.nodes),))
     params = PullParams(values, like.params.attachment, like.params.width, like.params.ends)
-    return Term(PullEnergy(like.kind.points), np.asarray(like.nodes), params)  # type: ignore[attr-defined]
+    return Term(PullEnergy(like.kind.points, shared), np.asarray(like.nodes), params)  # type: ignore[attr-defined]

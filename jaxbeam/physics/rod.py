@@ -46,6 +46,7 @@ from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, namespace, pytree
 from jaxbeam.mesh.line import Line, beside
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Energy, NotRefinable, Term
 from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
 
@@ -97,7 +98,7 @@ class RodEnergy(Energy):
     def margin(self, x: jax.Array, params: RodParams) -> jax.Array:
         return jnp.min(jax.vmap(fibre_stretches)(x, params), axis=1)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         raise NotRefinable("a rod has the error of its model, which no finer mesh shows")
 
     def sides(self, x: jax.Array, params: RodParams) -> list[jax.Array]:

@@ -15,6 +15,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace
 from jaxbeam.mesh.line import Line, beside
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import NotRefinable, Term
 from jaxbeam.physics.tendon import (
     TendonEnergy,
@@ -50,7 +51,7 @@ class RodTendonEnergy(TendonEnergy):
     points: Callable[[jax.Array, Any], jax.Array] = at_offsets
     coordinates: ClassVar[int | None] = 3
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         raise NotRefinable("it is tied to the sections of a rod")
 
     def without_limit(self, term: Term, free: np.ndarray) -> str:

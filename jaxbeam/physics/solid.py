@@ -15,6 +15,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics import quadrature
 from jaxbeam.physics.energy import Energy, Term
 from jaxbeam.physics.materials import check_density, macklin_mueller, material_is_valid
@@ -62,8 +63,8 @@ class SolidEnergy(Energy):
         bound = 0.0 if forbids_inversion(self.density, params) else RELEASED
         return admissible_step(x, dx, params, keep, bound, RELEASED)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
-        material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), parts, axis=0), term.params.material)
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
+        material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), finer.parts, axis=0), term.params.material)
         degree = element_of(term.nodes).degree_of(term.params.weights.shape[1])
         return solid(mesh, material, self.density, max(degree, element_of(mesh.elements).degree))
 

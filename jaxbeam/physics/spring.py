@@ -12,6 +12,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 from jaxbeam.physics.load import PointParams
 
@@ -28,7 +29,7 @@ class SpringEnergy(Energy):
     def valid(self, params: PointParams) -> jax.Array:
         return jnp.all(params.value >= 0)
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         return term
 
 

@@ -18,6 +18,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import patch
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 
@@ -90,6 +91,7 @@ class LineEnergy(Energy):
     """
 
     points: Callable[[jax.Array, Any], jax.Array]
+    shared_command: bool
     coordinates: ClassVar[int | None] = 2
 
     def length(self, x: jax.Array, params: Any) -> jax.Array:
@@ -131,10 +133,12 @@ class TendonEnergy(LineEnergy):
 
     stiffness: the law `(modulus, commanded) -> k`.
     points: from the nodes `x` of the tendon and its `attachment`, the points of its line.
+    shared_command: whether one ratio commands all tendons of the term.
     """
 
     stiffness: Callable[[jax.Array, jax.Array], jax.Array]
     points: Callable[[jax.Array, Any], jax.Array] = at_nodes
+    shared_command: bool = False
     name: ClassVar[str] = "tendon"
     rest_command: ClassVar[float | None] = 1.0
     commands: ClassVar[checks.Range] = checks.POSITIVE
@@ -155,7 +159,8 @@ class TendonEnergy(LineEnergy):
         return replace(params, commanded=to_device(commanded))
 
     def command_of(self, params: TendonParams) -> jax.Array:
-        return params.commanded / params.natural
+        ratios = params.commanded / params.natural
+        return ratios[:1] if self.shared_command else ratios
 
     def partway(self, params: TendonParams, share: jax.Array) -> TendonParams:
         return replace(params, commanded=(1 - share) * params.natural + share * params.commanded)
@@ -163,11 +168,12 @@ class TendonEnergy(LineEnergy):
     def valid(self, params: TendonParams) -> jax.Array:
         return jnp.all((params.commanded > 0) & (params.modulus > 0))
 
-    def refined(self, term: Term, mesh: Mesh, parts: int) -> Term:
+    def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         params = term.params
         if params.width is None:
             return term
-        new = tendons(mesh, params.ends, params.modulus, self.stiffness, np.asarray(params.width))
+        width = np.asarray(params.width)
+        new = tendons(mesh, params.ends, params.modulus, self.stiffness, width, self.shared_command)
         params = replace(new.params, natural=params.natural, commanded=params.commanded)
         return Term(self, new.nodes, params)
 
@@ -198,11 +204,16 @@ def tendons(
     modulus: Numbers,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
     width: Numbers = 0.0,
+    shared: bool = False,
 ) -> Term:
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
 
     They are two-way springs: one that is longer than its ends are apart pushes. At ratios (1.2, 1) the top tendon of
     the reference scene pushes with 125. `cables` only pull.
+
+    Between its ends a tendon slides, so its tension is the same along its whole length. A tendon that is glued to the
+    body is a row for each segment between two neighbouring nodes, with `shared=True`: each segment has its own tension,
+    and one command shortens them all.
 
     Args:
         mesh: its rest positions determine the natural lengths, which are differentiable in them.
@@ -215,12 +226,14 @@ def tendons(
         width: width of the patch of surface that each node stands for (see `jaxbeam.mesh.surface`); scalar or `(m, k)`.
             At 0 the tendon pulls on the node alone. This is a point load: its answer has no limit as the mesh is
             refined.
+        shared: whether one ratio commands all of them, in place of one each.
 
     Raises:
         ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
             nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
     """
     check_law(stiffness)
+    checks.flag("shared", shared)
     lines = check_lines(mesh, nodes)
     modulus = checks.numbers("modulus", modulus, checks.POSITIVE, ((), lines.shape[:1]))
     if not is_concrete(width):
@@ -230,11 +243,12 @@ def tendons(
     dtype, rest = mesh.nodes.dtype, namespace(mesh.nodes).asarray(mesh.nodes)
     anchored: tuple[np.ndarray, ...] = ()
     if not widths.any():
-        nodes_of, energy = lines, TendonEnergy(stiffness)
+        nodes_of, energy = lines, TendonEnergy(stiffness, at_nodes, shared)
         natural = polyline_length(rest[lines])
     else:
         nodes_of, weights = _patch_means(mesh, lines, widths)
-        energy, anchored = TendonEnergy(stiffness, at_means), (weights.astype(dtype), widths.astype(dtype), lines)
+        energy = TendonEnergy(stiffness, at_means, shared)
+        anchored = (weights.astype(dtype), widths.astype(dtype), lines)
         places = from_first(np.asarray(rest)[nodes_of])
         natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, places).astype(dtype))
     xp = namespace(modulus)

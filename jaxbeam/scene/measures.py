@@ -88,6 +88,12 @@ def tendon_tensions(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 @one_program
+def tendon_slack(scene: Scene, x: jax.Array) -> jax.Array:
+    """Whether each tendon is slack, `(m,)` booleans: a cable without tension. A two-way tendon never is; it pushes."""
+    return tendon_tensions(scene, x) == 0
+
+
+@one_program
 def guide_forces(scene: Scene, x: jax.Array) -> list[jax.Array]:
     """Forces of tendons and cables on the body at each of their points: their ends and guides.
 

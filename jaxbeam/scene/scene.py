@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import one_program, usual_rules
+from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import (
     Numbers,
     holds_arrays,
@@ -40,16 +40,16 @@ class Scene:
     Args:
         mesh: the body at rest, with `n` nodes of `d` coordinates: 2, or 3 on a `Line` (see `jaxbeam.mesh.line`).
         terms: the energies that are summed; one that is absent is never traced.
-        fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`). These coordinates are
-            eliminated from the unknowns.
+        fixed: `(n, d)` booleans, true for a coordinate that does not move (see `clamped`).
         tip: `(q,)` node numbers of the end section that the tip measures follow; may be empty.
 
-    The attribute `surface`, `(e, 2)` or `(e, 3)`, is computed: edges of the surface of the solids, by node numbers (see
-    `jaxbeam.mesh.surface`).
+    Two attributes are computed: `surface`, `(e, 2)` or `(e, 3)`, the edges of the surface of the solids by node numbers
+    (see `jaxbeam.mesh.surface`); and `held` `(n, d)`, true for a coordinate that is fixed or that a support moves. Held
+    coordinates are eliminated from the unknowns.
 
     Raises:
-        ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a term's node is out of range,
-            a term of solids acts on a rod, or an energy returns no scalar.
+        ValueError: if `fixed` or `tip` has another shape or dtype, all is fixed, a coordinate is held twice, a term's
+            node is out of range, a term of solids acts on a rod, or an energy returns no scalar.
     """
 
     mesh: Mesh
@@ -57,6 +57,7 @@ class Scene:
     fixed: np.ndarray = index_field()
     tip: np.ndarray = index_field(default_factory=lambda: np.zeros(0, np.int32))
     surface: np.ndarray = index_field(init=False)
+    held: np.ndarray = index_field(init=False)
 
     def __post_init__(self) -> None:
         checks.instance(
@@ -71,8 +72,6 @@ class Scene:
                 f"fixed: expected booleans of shape {shape}, got shape {fixed.shape} of dtype {fixed.dtype}; "
                 f"make them with clamped(mesh, nodes)"
             )
-        if fixed.all():
-            raise ValueError("fixed: every coordinate is fixed, nothing is left to solve for")
         if not isinstance(self.terms, tuple) or not self.terms or not all(isinstance(t, Term) for t in self.terms):
             raise ValueError(f"terms: expected a tuple of at least one Term, got {self.terms!r}")
         for number, term in enumerate(self.terms):
@@ -84,10 +83,13 @@ class Scene:
                     f"{shape[1]}; on triangles use solid and tendons, on the Line of a rod use rod and rod_tendons"
                 )
             _check_energy(number, term, self.mesh.nodes)
-            if objection := term.kind.objection(term, fixed):
+        held = _held(fixed, self.terms)
+        for number, term in enumerate(self.terms):
+            if objection := term.kind.objection(term, held):
                 raise ValueError(f"terms[{number}]: {objection}")
         tip = check_nodes("tip", self.mesh, self.tip, ndim=1) if np.size(self.tip) else np.zeros(0)
         object.__setattr__(self, "fixed", read_only(fixed))
+        object.__setattr__(self, "held", read_only(held))
         object.__setattr__(self, "tip", read_only(tip, np.int32))
         bodies = tuple(key_of(term, "nodes") for term in self.terms if term.kind.fills)
         object.__setattr__(self, "surface", surface_of(bodies))
@@ -96,10 +98,31 @@ class Scene:
         if not holds_arrays(self, self.mesh.nodes):
             return "Scene(a tree of other values)"
         terms = ", ".join(f"{len(term.nodes)} x {term.kind.name}" for term in self.terms)
-        free = f"{int((~self.fixed).sum())} of {self.fixed.size} coordinates free"
+        free = f"{int((~self.held).sum())} of {self.fixed.size} coordinates free"
         commands = commands_of(self)
         known = np.array2string(np.asarray(commands), precision=6) if is_concrete(commands) else "traced"
         return f"Scene({self.mesh.summary()}; {terms}; {free}; commands {known})"
+
+
+def _held(fixed: np.ndarray, terms: tuple[Term, ...]) -> np.ndarray:
+    """Coordinates `(n, d)` that are fixed or that a support holds; refused if one is held twice, or none is free."""
+    held, names = fixed.copy(), ("x", "y", "the angle")
+    for number, term in enumerate(terms):
+        if not term.kind.holds:
+            continue
+        nodes, own = np.asarray(term.nodes).ravel(), np.zeros(fixed.shape, bool)
+        own[nodes] = term.kind.holds
+        if (own & held).any():
+            node, coordinate = np.argwhere(own & held)[0]
+            other = "`fixed`" if fixed[node, coordinate] else "another support"
+            raise ValueError(
+                f"terms[{number}]: {other} holds {names[coordinate]} of node {node} too, so it may be told two "
+                f"displacements; leave that node or coordinate out of one of them"
+            )
+        held |= own
+    if held.all():
+        raise ValueError("fixed: every coordinate is fixed, nothing is left to solve for")
+    return held
 
 
 def _check_dtype(number: int, term: Term, dtype: Any) -> None:
@@ -241,6 +264,25 @@ def command_units(scene: Scene, low: jax.Array, high: jax.Array) -> jax.Array:
     return jnp.where(np.isfinite(known), known, jnp.where(width > 0, width, 1))
 
 
+def has_supports(scene: Scene) -> bool:
+    """Whether some held coordinates move."""
+    return any(term.kind.holds for term in scene.terms)
+
+
+def places(scene: Scene) -> jax.Array:
+    """Positions `(n, d)` at which held coordinates are to be; of the others, those at rest."""
+    x = scene.mesh.nodes
+    for term in scene.terms:
+        if term.kind.holds:
+            x = x.at[term.nodes].add(term.kind.displacements(term.params))
+    return x
+
+
+def at_places(scene: Scene, x: jax.Array) -> jax.Array:
+    """Positions `x` `(n, d)` with held coordinates at their places; if nothing moves them, `x` itself."""
+    return jnp.where(scene.held, places(scene), x) if has_supports(scene) else x
+
+
 def partway(scene: Scene, share: jax.Array) -> Scene:
     """The scene with a share `()` of its actuation and its loads: none at 0, all at 1."""
     terms = [replace(term, params=term.kind.partway(term.params, share)) for term in scene.terms]
@@ -257,96 +299,6 @@ def is_valid(scene: Scene) -> jax.Array:
     return valid
 
 
-# ------------------------------------------------------------------------- energy, forces, Hessians
-
-
-def extent(scene: Scene) -> jax.Array:
-    """The size of the body `()`: its largest extent at rest. It does not depend on where the body lies."""
-    return jnp.max(jnp.ptp(scene.mesh.nodes, axis=0))
-
-
-class Evaluation(NamedTuple):
-    """Energy and its gradient, each with a scale: the sum of the magnitudes of the numbers that were added up.
-
-    The scales tell how large the round-off is. The relative residual is relative to the scale of the gradient.
-
-    energy: `()` energy of all terms.
-    energy_scale: `()` sum of the magnitudes of the stencil energies.
-    gradient: `(n, d)` derivative of the energy in the positions.
-    gradient_scale: `(n, d)` sum of the magnitudes of the stencil gradients at each coordinate.
-    """
-
-    energy: jax.Array
-    energy_scale: jax.Array
-    gradient: jax.Array
-    gradient_scale: jax.Array
-
-
-# Jitted, so that programs of the same scene share its trace.
-@jax.jit
-def evaluate(scene: Scene, x: jax.Array) -> Evaluation:
-    """Energy and gradient at node positions `x` `(n, d)`."""
-    energy = energy_scale = jnp.zeros((), x.dtype)
-    both = jnp.zeros((*x.shape, 2), x.dtype)
-    for term in scene.terms:
-        energies, gradients = term.kind.gradients(x[term.nodes], term.params)
-        energy += jnp.sum(energies)
-        energy_scale += jnp.sum(jnp.abs(energies))
-        both = both.at[term.nodes].add(jnp.stack([gradients, jnp.abs(gradients)], axis=-1))
-    return Evaluation(energy, energy_scale, both[..., 0], both[..., 1])
-
-
-@one_program
-def energy(scene: Scene, x: jax.Array) -> jax.Array:
-    """Total energy `()` at node positions `x` `(n, 2)`; differentiable in the scene and in `x`."""
-    x = placed(scene, x)
-    return sum((jnp.sum(jax.vmap(t.energy)(x[t.nodes], t.params)) for t in scene.terms), jnp.zeros((), x.dtype))
-
-
-@one_program
-def forces(scene: Scene, x: jax.Array) -> jax.Array:
-    """Force `(n, 2)` of all terms on each node: minus the gradient of the energy."""
-    return -evaluate(scene, placed(scene, x)).gradient
-
-
-@one_program
-def reactions(scene: Scene, x: jax.Array) -> jax.Array:
-    """Force `(n, 2)` of the clamp on each node, zero for coordinates that are free.
-
-    At equilibrium the reactions balance the external loads. Tendons are part of the body: they act on it at both ends,
-    so that their forces cancel in this balance.
-    """
-    return jnp.where(scene.fixed, -forces(scene, x), 0)
-
-
-def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[jax.Array]:
-    """For each term, the Hessians `(k d, k d, m)` of its stencils; with `convex`, positive semidefinite ones."""
-    return [term.kind.hessians(x[term.nodes], term.params, convex) for term in scene.terms]
-
-
-@one_program
-def smallest_jacobian(scene: Scene, x: jax.Array) -> jax.Array:
-    """Smallest `J = det F` `()` anywhere in the solids at `x`, or stretch of a fibre of the rods, whichever is less.
-
-    It is the smallest over whole elements, not only over quadrature points. Infinite in a scene without either.
-    """
-    return worst_element(scene, placed(scene, x))[0]
-
-
-def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What `smallest_jacobian` returns, `()`, and the number `()` of the element where it lies.
-
-    In a scene without solids and rods they are infinity and -1.
-    """
-    found = [term.kind.margin(x[term.nodes], term.params) for term in scene.terms]
-    margins = [each for each in found if each is not None]
-    if not margins:
-        return jnp.asarray(jnp.inf, x.dtype), jnp.asarray(-1, jnp.int32)
-    every = jnp.concatenate(margins)
-    element = jnp.argmin(every)
-    return every[element], element.astype(jnp.int32)
-
-
 def longest_increment(start: Scene, end: Scene) -> jax.Array | None:
     """The largest share `()` of the way between two scenes that may be taken in one solve; None: all of it.
 
@@ -361,14 +313,6 @@ def longest_increment(start: Scene, end: Scene) -> jax.Array | None:
     return jnp.min(jnp.stack(limits)) if limits else None
 
 
-def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
-    """Largest `t` `()` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
-
-    Each energy gives its own limit, and may allow `J` to pass through zero (see `Energy.longest_step`).
-    """
-    limits = [jnp.asarray(jnp.inf, x.dtype)]
-    for term in scene.terms:
-        steps = term.kind.longest_step(x[term.nodes], dx[term.nodes], term.params, keep)
-        if steps is not None:
-            limits.append(jnp.min(steps))
-    return jnp.min(jnp.stack(limits))
+def extent(scene: Scene) -> jax.Array:
+    """The size of the body `()`: its largest extent at rest. It does not depend on where the body lies."""
+    return jnp.max(jnp.ptp(scene.mesh.nodes, axis=0))

@@ -1,7 +1,8 @@
-"""The origin of a continuation: a known state, and the scenes between it and the scene to be solved."""
+"""The scenes between a known state and the scene to be solved, and how forces and supports change on the way."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -10,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.tree import to_device
-from jaxbeam.scene.scene import Scene, command, commands_of, partway, rest_commands
+from jaxbeam.scene.evaluation import energy
+from jaxbeam.scene.scene import Scene, at_places, command, commands_of, partway, places, rest_commands
 
 
 class Origin(NamedTuple):
@@ -73,3 +75,18 @@ def scene_between(origin: Origin, scene: Scene, s: jax.Array) -> Scene:
     # At `s = 1` take the leaves of `scene`, to the last bit. A leaf that no command or load changes is the same array
     # in both.
     return jax.tree.map(lambda own, other: own if own is other else jnp.where(s == 1, own, other), scene, between)
+
+
+def force_rate(scene_at: Callable[[jax.Array], Scene], s: jax.Array, x: jax.Array) -> jax.Array:
+    """Derivative `(n, d)` in `s` of the energy's gradient at the state `x`, whose supports move with `s`."""
+
+    def gradient(s: jax.Array) -> jax.Array:
+        scene = scene_at(s)
+        return jax.grad(energy, argnums=1)(scene, at_places(scene, x))
+
+    return jax.jvp(gradient, (s,), (jnp.ones_like(s),))[1]
+
+
+def support_rate(scene_at: Callable[[jax.Array], Scene], s: jax.Array) -> jax.Array:
+    """Derivative `(n, d)` in `s` of the places of held coordinates; zero for the others."""
+    return jax.jvp(lambda s: jnp.where(scene_at(s).held, places(scene_at(s)), 0), (s,), (jnp.ones_like(s),))[1]

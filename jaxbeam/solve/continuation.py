@@ -4,7 +4,7 @@ The path has a parameter `s`; an equilibrium is asked for at each of a few targe
 one target. The compiled program has a single Newton loop, which all solves share.
 
 An *attempt* is one Newton solve from a predicted start. Its state is *accepted* if it converged, unless it is a saddle
-or the increment may have been too long (see `_judge`). A failed attempt halves the increment, and an
+or the increment may have been too long (see `_judge`). A failed attempt halves the increment, an
 accepted one doubles it.
 """
 
@@ -21,9 +21,11 @@ from jax import lax
 
 from jaxbeam.core.compiling import choose
 from jaxbeam.linear.layout import Layout
+from jaxbeam.scene.evaluation import worst_element
 from jaxbeam.scene.overlap import crossing
-from jaxbeam.scene.scene import Scene, commands_of, energy, extent, is_valid, longest_increment, worst_element
+from jaxbeam.scene.scene import Scene, commands_of, extent, has_supports, is_valid, longest_increment
 from jaxbeam.solve import newton
+from jaxbeam.solve.actuation import force_rate, support_rate
 from jaxbeam.solve.newton import INACCURATE, Newton
 from jaxbeam.solve.predictor import Trail, extend, predict
 from jaxbeam.solve.report import PackedReport, Report, unpack, write, zeros
@@ -249,9 +251,6 @@ def _attempt(problem: Problem, state: Continuation, scene: Scene, max_steps: jax
     The response to its probe is the tangent of the branch. At a saddle it is a soft mode, along which the next attempt
     leaves.
     """
-    one = jnp.ones((), state.parameter.dtype)
-    gradient = lambda s, x: jax.grad(energy, argnums=1)(problem.scene_at(s), x)
-    rate = lambda x: jax.jvp(lambda s: gradient(s, x), (state.parameter,), (one,))[1]
     policy = newton.Policy(
         max_steps=jnp.where(state.given_up, 0, max_steps),
         full_steps=jnp.where(state.trail.depth > 0, FULL_STEPS, 0),
@@ -259,9 +258,13 @@ def _attempt(problem: Problem, state: Continuation, scene: Scene, max_steps: jax
         reuse_factor=state.parameter < problem.targets[-1] if len(problem.targets) > 1 else None,
         leaving_saddle=state.escapes > 0,
         # At a saddle the response to random forces consists mostly of soft modes.
-        probe=lambda x, definite: jnp.where(definite, rate(x), problem.noise),
+        probe=lambda x, definite: jnp.where(definite, force_rate(problem.scene_at, state.parameter, x), problem.noise),
     )
-    return newton.newton(scene, problem.layout, state.start, state.displacement, policy, problem.solver)
+    found = newton.newton(scene, problem.layout, state.start, state.displacement, policy, problem.solver)
+    if has_supports(scene):
+        carried = jnp.where(found.stiffness.definite, support_rate(problem.scene_at, state.parameter), 0)
+        found = found._replace(response=found.response + carried)
+    return found
 
 
 def _report(problem: Problem, state: Continuation, scene: Scene, attempt: newton.State) -> Report:

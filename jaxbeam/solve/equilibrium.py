@@ -20,20 +20,9 @@ from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, is_concrete, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.linear.tridiagonal import BlockTridiagonal
-from jaxbeam.scene.scene import (
-    Scene,
-    check_scene,
-    command,
-    commands_of,
-    energy,
-    evaluate,
-    placed,
-    rest_commands,
-    smallest_jacobian,
-    stencil_hessians,
-    worst_element,
-)
-from jaxbeam.scene.supports import check_held
+from jaxbeam.scene.evaluation import energy, evaluate, smallest_jacobian, stencil_hessians, worst_element
+from jaxbeam.scene.rigid import check_held
+from jaxbeam.scene.scene import Scene, at_places, check_scene, command, commands_of, has_supports, placed, rest_commands
 from jaxbeam.solve.actuation import Origin, from_rest, scene_between
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.implicit import attach_derivative, attach_derivative_of_root, linear_gradient
@@ -120,8 +109,10 @@ def _linear_response(scene: Scene, layout: Layout, linear: LinearSolver) -> tupl
     """
     rest = scene.mesh.nodes
     factor, stable = linear.factor(layout, assemble(layout, stencil_hessians(scene, rest)))
-    step = linear.solve(layout, factor, gather(layout, evaluate(scene, rest).gradient))
-    return rest - expand(layout, step, rest.shape), stable, factor
+    start = at_places(scene, rest)
+    gradient = linear_gradient(scene, start) if has_supports(scene) else evaluate(scene, rest).gradient
+    step = linear.solve(layout, factor, gather(layout, gradient))
+    return start - expand(layout, step, rest.shape), stable, factor
 
 
 @partial(jax.jit, static_argnames="linear")
@@ -133,7 +124,7 @@ def _moving_response(
     # depend on this one.
     finite = jnp.where(stable, x, lax.stop_gradient(scene.mesh.nodes))
     moving = attach_derivative_of_root(linear, linear_gradient, scene, layout, finite, factor, stable)
-    return moving + jnp.where(stable | scene.fixed, 0, jnp.nan).astype(x.dtype)
+    return moving + jnp.where(stable | scene.held, 0, jnp.nan).astype(x.dtype)
 
 
 @compiled("solver")

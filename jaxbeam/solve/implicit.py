@@ -27,7 +27,8 @@ from jax import lax
 
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
-from jaxbeam.scene.scene import Scene, energy, stencil_hessians
+from jaxbeam.scene.evaluation import energy, stencil_hessians
+from jaxbeam.scene.scene import Scene, places
 
 Gradient = Callable[[Scene, jax.Array], jax.Array]
 
@@ -116,8 +117,8 @@ def _attach_derivative_jvp(
         # NaN if not trusted, except for a zero right-hand side: that of a loss that does not depend on this solution.
         return jnp.where(trusted, y, jnp.where(jnp.all(b == 0), 0.0, jnp.nan).astype(y.dtype))
 
-    # Fixed coordinates are at their rest positions, and have the tangent of these.
-    fixed_dot = jnp.where(scene.fixed, scene_dot.mesh.nodes, 0)
-    gradient_dot = jax.jvp(gradient, (scene, at), (scene_dot, fixed_dot))[1]
+    # Held coordinates are at their places, and have the tangent of these.
+    held_dot = jnp.where(scene.held, jax.jvp(places, (scene,), (scene_dot,))[1], 0)
+    gradient_dot = jax.jvp(gradient, (scene, at), (scene_dot, held_dot))[1]
     free_dot = lax.custom_linear_solve(product, -gather(layout, gradient_dot), solve, symmetric=True)
-    return x, expand(layout, free_dot, x.shape) + fixed_dot
+    return x, expand(layout, free_dot, x.shape) + held_dot

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxbeam.core.compiling import choose
-from jaxbeam.scene.scene import Evaluation, Scene, evaluate, largest_step
+from jaxbeam.scene.evaluation import Evaluation, evaluate, largest_step
+from jaxbeam.scene.scene import Scene
 
 # Armijo's condition asks for this share of the decrease that the slope predicts.
 ARMIJO = 1e-4

@@ -23,7 +23,8 @@ from jaxbeam.core.tree import key_of
 from jaxbeam.linear.blocks import Topology
 from jaxbeam.linear.layout import Layout, LinearSolver, expand, gather
 from jaxbeam.linear.tridiagonal import BlockTridiagonal
-from jaxbeam.scene.scene import Evaluation, Scene, check_scene, evaluate, extent
+from jaxbeam.scene.evaluation import Evaluation, evaluate
+from jaxbeam.scene.scene import Scene, check_scene, extent, has_supports, places
 from jaxbeam.solve.line_search import line_search
 from jaxbeam.solve.residual import force_round_off, force_scale, relative_residual
 from jaxbeam.solve.stiffness import Stiffness, factorise, is_singular, zero_factor
@@ -87,7 +88,7 @@ def check_scene_and_solver(scene: Scene, solver: Newton) -> None:
 def topology(scene: Scene) -> Topology:
     """The structure of a scene, on which the layout of its matrix depends."""
     nodes = tuple(key_of(term, "nodes") for term in scene.terms)
-    return Topology(key_of(scene.mesh, "elements"), key_of(scene, "fixed"), nodes)
+    return Topology(key_of(scene.mesh, "elements"), key_of(scene, "held"), nodes)
 
 
 # --------------------------------------------------------------------------------- data of the method
@@ -166,6 +167,7 @@ class Problem(NamedTuple):
     policy: what the run is allowed to do.
     solver: settings.
     size: `()` size of the body.
+    places: `(n, d)` where held coordinates are to be, if there are supports; else None.
     """
 
     scene: Scene
@@ -173,6 +175,7 @@ class Problem(NamedTuple):
     policy: Policy
     solver: Newton
     size: jax.Array
+    places: jax.Array | None
 
 
 # --------------------------------------------------------------------------------- init, step, terminate
@@ -196,7 +199,7 @@ def newton(
     Returns:
         The final state. `running` is false; the residual tells whether the method converged.
     """
-    problem = Problem(scene, layout, policy, solver, extent(scene))
+    problem = Problem(scene, layout, policy, solver, extent(scene), places(scene) if has_supports(scene) else None)
     begin = init(problem, x, displacement)
     end = lax.while_loop(lambda state: state.running, partial(step, problem), begin)
     return end._replace(singular=is_singular(scene, layout, end.x, problem.size, end.stiffness, solver.linear))
@@ -227,10 +230,12 @@ def step(problem: Problem, state: State) -> State:
     scene, policy, solver = problem.scene, problem.policy, problem.solver
     rtol = solver.tolerance(state.x.dtype)
     full = state.initial | (state.stiffness.definite & (state.counts.steps < policy.full_steps))
+    # A step that moves supports does work, so it may raise the energy.
+    forced = state.initial if problem.places is None else state.initial | jnp.any(_gap(problem, state.x) != 0)
     x, evaluation, halvings, moved = line_search(
-        scene, state.x, state.evaluation, state.step, state.initial, full, solver.keep_volume
+        scene, state.x, state.evaluation, state.step, forced, full, solver.keep_volume
     )
-    unbalanced = jnp.max(jnp.abs(jnp.where(scene.fixed, 0, evaluation.gradient)))
+    unbalanced = jnp.max(jnp.abs(jnp.where(scene.held, 0, evaluation.gradient)))
     allowed = rtol * force_scale(scene, evaluation)
     balanced = unbalanced <= allowed
 
@@ -240,6 +245,9 @@ def step(problem: Problem, state: State) -> State:
     )
     stiffness = compute_if(renew, stiffness_at, state.stiffness, x, unbalanced, allowed)
     residual = relative_residual(scene, evaluation, force_round_off(stiffness.rows, x), rtol)
+    if problem.places is not None:
+        gap = jnp.max(jnp.abs(_gap(problem, x))) / problem.size
+        residual = jnp.maximum(residual, jnp.where(gap > 0, gap + 2 * rtol, 0))
     next_step, response = _solve(problem, state, x, evaluation, stiffness, reuse)
     correction = jnp.max(jnp.abs(next_step)) / problem.size
     # The forces balance, but a step would still move the body: rounding of the positions keeps them off equilibrium
@@ -293,6 +301,13 @@ def _reuse(problem: Problem, state: State, balanced: jax.Array) -> tuple[jax.Arr
     return reuse, ~reuse
 
 
+def _gap(problem: Problem, x: jax.Array) -> jax.Array:
+    """What is left, `(n, d)`, until held coordinates are at their places; zero where it is round-off."""
+    assert problem.places is not None
+    gap = jnp.where(problem.scene.held, problem.places - x, 0)
+    return jnp.where(jnp.abs(gap) <= 4 * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)), 0, gap)
+
+
 def _solve(
     problem: Problem,
     state: State,
@@ -312,14 +327,20 @@ def _solve(
         return jax.jvp(lambda x: evaluate(problem.scene, x).gradient, (x,), (response,))[1], response
 
     # With a reused factor, refine the last response by one residual correction instead of solving for it anew.
-    zeros = jnp.zeros_like(x)
+    zeros, gradient = jnp.zeros_like(x), evaluation.gradient
+    gap = zeros
+    if problem.places is not None:
+        gap = _gap(problem, x)
+        # The forces change as supports move.
+        change = lambda x, gap: jax.jvp(lambda x: evaluate(problem.scene, x).gradient, (x,), (gap,))[1]
+        gradient += compute_if(jnp.any(gap != 0), change, zeros, x, gap)
     left, response = compute_if(reuse, refinement, (zeros, zeros), x, state.response)
     probe = problem.policy.probe(x, stiffness.definite)
-    loads = jnp.stack([evaluation.gradient, probe + left])
+    loads = jnp.stack([gradient, probe + left])
     loads = jax.vmap(gather, in_axes=(None, 0), out_axes=1)(problem.layout, loads)
     moves = problem.solver.linear.solve(problem.layout, stiffness.factor, loads)
     moves = jax.vmap(lambda move: expand(problem.layout, -move, x.shape), in_axes=1)(moves)
-    return moves[0], response + moves[1]
+    return moves[0] + gap, response + moves[1]
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:

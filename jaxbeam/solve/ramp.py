@@ -11,8 +11,8 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout
+from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene, checked_commands, command, rest_commands
-from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology

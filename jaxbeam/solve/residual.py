@@ -12,7 +12,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from jaxbeam.scene.scene import Evaluation, Scene
+from jaxbeam.scene.evaluation import Evaluation
+from jaxbeam.scene.scene import Scene
 
 # Round-off of the force at a coordinate, over `eps max|x|` times the sum of the magnitudes in its row of the stiffness.
 # Measured: below 0.53 for triangles of three and six nodes, all materials and stiffnesses, and slender beams.
@@ -25,7 +26,7 @@ LONGEST_ROW = 100.0
 
 def force_scale(scene: Scene, evaluation: Evaluation) -> jax.Array:
     """The largest sum of the magnitudes of the stencil forces at one free coordinate, `()`."""
-    return jnp.max(jnp.where(scene.fixed, 0, evaluation.gradient_scale))
+    return jnp.max(jnp.where(scene.held, 0, evaluation.gradient_scale))
 
 
 def row_magnitudes(scene: Scene, hessians: list[jax.Array]) -> jax.Array:
@@ -89,5 +90,5 @@ def relative_residual(scene: Scene, evaluation: Evaluation, round_off: jax.Array
     scale = force_scale(scene, evaluation) + round_off / rtol
     # A coordinate on which no force acts is in balance.
     return jnp.max(
-        jnp.where(scene.fixed | (scale == 0), 0, jnp.abs(evaluation.gradient) / jnp.where(scale == 0, 1, scale))
+        jnp.where(scene.held | (scale == 0), 0, jnp.abs(evaluation.gradient) / jnp.where(scale == 0, 1, scale))
     )

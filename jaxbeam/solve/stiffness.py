@@ -17,7 +17,8 @@ from jax import lax
 
 from jaxbeam.core.compiling import compute_if, zeros_like_result
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, gather
-from jaxbeam.scene.scene import Scene, stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
+from jaxbeam.scene.scene import Scene
 from jaxbeam.solve.residual import row_magnitudes, rows_may_decide
 
 # Pivots of a singular stiffness come out at 0.1 to 2.8 eps sqrt(N) times the diagonal on bodies that float free, and at
@@ -169,7 +170,7 @@ def is_singular(
         linear: the linear solver.
     """
     signs = jnp.asarray(np.random.default_rng(1).choice([-1.0, 1.0], x.shape), x.dtype)
-    load = gather(layout, jnp.where(scene.fixed, 0, signs))
+    load = gather(layout, jnp.where(scene.held, 0, signs))
 
     def softest(factor: Any) -> jax.Array:
         """Rayleigh quotient of one inverse iteration: near a limit of stability it is the lowest eigenvalue."""

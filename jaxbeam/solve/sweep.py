@@ -27,8 +27,9 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
 from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
-from jaxbeam.scene.scene import Scene, check_commands, command, energy, partway, rest_commands
-from jaxbeam.scene.supports import check_held
+from jaxbeam.scene.evaluation import energy
+from jaxbeam.scene.rigid import check_held
+from jaxbeam.scene.scene import Scene, at_places, check_commands, command, has_supports, partway, rest_commands
 from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
@@ -228,12 +229,15 @@ def _continue(
     one = jnp.ones((), chunk.x.dtype)
     path, factor, after = follow(scene_at, layout, trail, one[None], solver, displacement=predict(trail, one))
     found = jax.tree.map(lambda leaf: leaf[0], path)
-    gradient = lambda r: jax.grad(energy, argnums=1)(command(scene, r), found.x)
+    placed = lambda r: at_places(command(scene, r), found.x)
+    gradient = lambda r: jax.grad(energy, argnums=1)(command(scene, r), placed(r))
     # `dx/dr = -K^-1 dg/dr`, one column for each ratio.
     load = lambda direction: gather(layout, jax.jvp(gradient, (ratios,), (direction,))[1])
     loads = jax.vmap(load, out_axes=1)(jnp.eye(len(ratios), dtype=ratios.dtype))
     moves = solver.linear.solve(layout, factor, loads)
     tangent = jax.vmap(lambda move: expand(layout, -move, found.x.shape), in_axes=1)(moves)
+    if has_supports(scene):
+        tangent += jnp.moveaxis(jax.jacfwd(placed)(ratios), -1, 0)
     known = (after.depth > 0) & jnp.all(jnp.isfinite(tangent))
     return Continued(found, after.x[0], tangent, known, (after.depth > 1) & (found.attempts == 1))
 

@@ -28,10 +28,10 @@ from jaxbeam.core.tree import is_concrete, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
-from jaxbeam.mesh.refinement import Finer, enriched_elements
-from jaxbeam.mesh.surface import surface
+from jaxbeam.mesh.refinement import Finer, enriched_elements, heirs
 from jaxbeam.physics.energy import NotRefinable, Term
-from jaxbeam.scene.scene import Scene, check_scene, evaluate, stencil_hessians
+from jaxbeam.scene.evaluation import evaluate, stencil_hessians
+from jaxbeam.scene.scene import Scene, check_scene
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
@@ -142,7 +142,7 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         met = estimate.bar <= tolerance
         stuck = bool(solution.status != 0) or not np.isfinite(estimate.bar)
         hopeless = tolerance < float(jnp.finfo(solution.x.dtype).eps) * abs(estimate.value)
-        if met or stuck or hopeless or not np.count_nonzero(~finer.fixed) <= most:
+        if met or stuck or hopeless or not np.count_nonzero(~finer.held) <= most:
             return Answer(estimate.value, estimate, met, rung, scene, solution)
         rung, scene, start = rung + 1, finer, ahead
 
@@ -166,24 +166,18 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
         raise ValueError("scene: expected a mesh of triangles to refine, got a rod, whose error is that of its model")
     finer = enriched_elements(elements, count)
     mesh = Mesh(finer.carry(np.asarray(scene.mesh.nodes)), finer.elements)
-    used = finer.weights != 0
-    # A new node is fixed if it lies on the surface between fixed nodes. Inside, an edge may join two clamps, and its
-    # middle is free. The same holds for nodes of the tip. Old nodes inherit from themselves.
-    outside = np.isin(np.arange(len(used)), surface(mesh))
-    inherit = lambda nodes: np.all(np.asarray(nodes)[finer.nodes] | ~used, axis=1)
-    new = np.arange(len(used)) >= count
-    old_or_outside = outside | ~new
-    fixed = np.stack([inherit(column) & old_or_outside for column in scene.fixed.T], axis=1)
-    tip = np.append(scene.tip, np.flatnonzero(inherit(np.isin(np.arange(count), scene.tip)) & outside & new))
-    parts = len(finer.elements) // len(elements)
-    terms = tuple(_refined(k, term, mesh, parts) for k, term in enumerate(scene.terms))
+    fixed = np.zeros(mesh.nodes.shape, bool)
+    for coordinate, column in enumerate(scene.fixed.T):
+        fixed[heirs(finer, mesh, np.flatnonzero(column)), coordinate] = True
+    terms = tuple(_refined(k, term, mesh, finer) for k, term in enumerate(scene.terms))
+    tip = heirs(finer, mesh, scene.tip)
     return Scene(mesh, terms, fixed, tip), finer
 
 
-def _refined(number: int, term: Term, mesh: Mesh, parts: int) -> Term:
-    """Term `number` of the scene on the finer mesh, where each element is divided into `parts`."""
+def _refined(number: int, term: Term, mesh: Mesh, finer: Finer) -> Term:
+    """Term `number` of the scene on the finer mesh."""
     try:
-        return term.kind.refined(term, mesh, parts)
+        return term.kind.refined(term, mesh, finer)
     except NotRefinable as error:
         raise NotRefinable(f"terms[{number}] ({term.kind.name}) has no form on a finer mesh: {error}") from None
 
@@ -227,7 +221,7 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
     """Why no error bound is known; empty if one is."""
     if solution.status != 0:
         return "the solution is not OK"
-    free = np.logical_not(scene.fixed.all(axis=1))
+    free = np.logical_not(scene.held.all(axis=1))
     for term in scene.terms:
         if reason := term.kind.without_limit(term, free):
             return reason
@@ -292,7 +286,7 @@ def _newton_step(
 
     The step is NaN if the stiffness is not positive definite.
     """
-    forces = jnp.where(scene.fixed, 0, evaluate(scene, x).gradient)
+    forces = jnp.where(scene.held, 0, evaluate(scene, x).gradient)
     sides = jnp.stack([gather(layout, -forces), gather(layout, slope)], axis=1)
     step, adjoint = (expand(layout, side, x.shape) for side in solver.linear.solve(layout, factor[0], sides).T)
     return jnp.where(factor[1], step, jnp.nan), adjoint, forces

@@ -1,16 +1,14 @@
 """Branches of equilibria, followed through folds, with the points where stability is lost and regained.
 
-Pseudo-arclength continuation (Keller 1977): a branch is a curve `(x(t), s(t))`, with `s` the parameter of the path: 0
-at rest (ratio 1) and 1 at the command asked for. The predictor goes along the tangent, and the corrector is Newton's
-method in the plane normal to the tangent. So a fold, where the branch turns back in `s`, is an ordinary point. The
-tangent stiffness is factorised unmodified, indefinite or not; the number of its negative eigenvalues tells stability.
+A branch leads from one scene to another that differs in its commands, its loads or any other numbers. It is followed
+step by step (`jaxbeam.study.arclength`). The number of negative eigenvalues of the tangent stiffness tells stability;
+where it changes is a critical point, and from a bifurcation the branch that crosses there can be followed.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,19 +16,17 @@ import numpy as np
 from jax import lax
 
 from jaxbeam.core import checks
-from jaxbeam.core.compiling import compiled, usual_rules
-from jaxbeam.core.tree import Numbers, unlock
-from jaxbeam.linear.layout import Layout, assemble, expand, gather
+from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.tree import Numbers
+from jaxbeam.scene.evaluation import smallest_jacobian
 from jaxbeam.scene.overlap import crossing
-from jaxbeam.scene.scene import Scene, command, evaluate, extent, rest_commands, smallest_jacobian, stencil_hessians
+from jaxbeam.scene.scene import Scene, command, extent, rest_commands
 from jaxbeam.solve.equilibrium import equilibrium
-from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
-from jaxbeam.solve.residual import force_round_off, relative_residual, row_magnitudes
-from jaxbeam.solve.solution import Status, check
+from jaxbeam.solve.newton import Newton, check_scene_and_solver
+from jaxbeam.solve.solution import EquilibriumError, Status, check
+from jaxbeam.study.arclength import Path, Point, path_between
 from jaxbeam.study.stability import lowest_mode
 
-# Limit of the corrections per step. A step that does not converge within it is halved.
-MAX_CORRECTIONS = 12
 # The next step may be longer only after one that took at most this many corrections.
 EASY = 4
 
@@ -41,11 +37,13 @@ class Critical:
 
     kind: `"fold"`, where the branch turns back, or `"bifurcation"`, where another branch crosses it.
     parameter: `s` at the point.
-    ratios: `(m,)` commands at the point.
+    ratios: `(m,)` commands at the point, ratios of tendons and others.
     x: `(n, 2)` positions.
     shape: `(n, 2)` mode that belongs to the eigenvalue.
     eigenvalue: its computed value, zero up to round-off.
     after: index of the last point of the branch before it.
+    residual: relative residual, as in `Solution`.
+    tangent: positions' part `(n, 2)` and parameter's part of the unit tangent of the branch that was traced.
     """
 
     kind: str
@@ -55,14 +53,16 @@ class Critical:
     shape: jax.Array
     eigenvalue: float
     after: int
+    residual: float
+    tangent: tuple[np.ndarray, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
     """A traced branch of `P` equilibria.
 
-    parameter: `(P,)` position `s` on the way from rest (ratio 1) to the command.
-    ratios: `(P, m)` commands.
+    parameter: `(P,)` position `s` on the way: 0 at its start, 1 at its end.
+    ratios: `(P, m)` commands, ratios of tendons and others.
     x: `(P, n, 2)` positions.
     negative: `(P,)` number of negative eigenvalues of the tangent stiffness; stable where it is 0.
     residual: `(P,)` relative residual, as in `Solution`.
@@ -89,34 +89,14 @@ class Branch:
         return self.negative == 0
 
 
-class Point(NamedTuple):
-    """A point on a branch.
-
-    x: `(n, d)` positions.
-    s: `()` parameter.
-    dx: `(n, d)` positions' part of the unit tangent.
-    ds: `()` parameter's part of the unit tangent.
-    negative: `()` number of negative eigenvalues of the tangent stiffness.
-    residual: `()` relative residual; infinite if the corrector did not converge.
-    corrections: `()` corrections taken to get there.
-    """
-
-    x: Any
-    s: Any
-    dx: Any
-    ds: Any
-    negative: Any
-    residual: Any
-    corrections: Any
-
-
 @usual_rules
 def trace_branch(
     scene: Scene,
-    ratios: Numbers,
+    end: Numbers | Scene,
     *,
     x0: Numbers | None = None,
     parameter: float = 0.0,
+    through: Critical | None = None,
     direction: int = 1,
     interval: tuple[float, float] = (0.0, 1.0),
     step: float = 0.02,
@@ -124,17 +104,23 @@ def trace_branch(
     solver: Newton = Newton(),
     progress: Callable[[int, float], None] | None = None,
 ) -> Branch:
-    """Follow one branch of equilibria of the commands `rest + s (ratios - rest)`, through its folds.
+    """Follow one branch of equilibria as commands, loads or other numbers change, through its folds.
 
-    At rest the ratio of a tendon is 1. At a fold a real beam jumps to another branch; this function stays on the same
-    one. It runs on the host, one jitted step after the other.
+    At a fold a real beam jumps to another branch; this function stays on the same one. It runs on the host, one jitted
+    step after the other. From a bifurcation of a traced branch, `through=branch.critical[0]` follows the branch that
+    crosses it there.
 
     Args:
-        scene: with `m` tendons.
-        ratios: `(m,)` the command at `s = 1`.
+        scene: with `m` commands.
+        end: commands `(m,)` at `s = 1`. They grow from those at rest (ratio 1 of tendons) at `s = 0`, and all else
+            stays as in `scene`. Or another scene, such as the same one under a larger load: then all numbers in which
+            the two differ change in proportion, from `scene` at `s = 0` to `end` at `s = 1`.
         x0: `(n, 2)` positions of the start: an equilibrium, or near one; by default the rest positions.
         parameter: `s` of the start.
-        direction: `1` to start towards larger `s`, `-1` towards smaller.
+        through: a bifurcation at which to start, in place of `x0` and `parameter`. Its branch ends there: to follow
+            both halves, call it with both directions.
+        direction: `1` to start towards larger `s`, `-1` towards smaller. From a bifurcation, `1` starts along its
+            `shape`, and `-1` against it.
         interval: range of `s`; the branch is followed until `s` leaves it.
         step: largest arclength of a step: the root of `(rms displacement / size)^2 + (change of s)^2`.
         max_points: largest number of points.
@@ -145,21 +131,30 @@ def trace_branch(
         A `Branch`.
 
     Raises:
-        ValueError: as `command` does, or if an argument is out of its range.
-        EquilibriumError: if there is no equilibrium at the start.
+        ValueError: as `command` does, if an argument is out of its range, if `end` is a scene with other terms or
+            nodes, or if `through` is not a bifurcation or given together with `x0` or `parameter`.
+        EquilibriumError: if there is no equilibrium at the start, or no other branch is found at the bifurcation.
     """
     check_scene_and_solver(scene, solver)
+    if through is not None:
+        parameter = _check_bifurcation(through, x0, parameter)
     interval, parameter, step = _check_way(direction, interval, parameter, step)
     checks.count("max_points", max_points, 1)
-    dtype = scene.mesh.nodes.dtype
-    command(scene, ratios)  # checks the ratios
-    path = Path(scene, np.asarray(ratios, dtype), solver.linear.layout(topology(scene)), solver)
-    x = np.asarray(_first_state(path, parameter, x0))
-    # Of the dtypes that `_advance` returns, so that it is compiled once.
-    count, residual = np.zeros((), np.int32), np.zeros((), dtype)
-    here = Point(x, dtype.type(parameter), np.zeros_like(x), dtype.type(direction), count, residual, count)
-    points, critical, ended = _walk(path, path.advance(here, 0.0), interval, step, max_points, progress)
-    return _branch(path, points, critical, ended)
+    if not isinstance(end, Scene):
+        scene, end = command(scene, rest_commands(scene)), command(scene, end)
+    path = path_between(scene, end, solver)
+    if through is None:
+        x = _first_state(path, parameter, x0)
+        points = [path.advance(_start(x, parameter, np.zeros_like(x), direction), 0.0)]
+    else:
+        points = _beside(path, through, direction, step)
+    return _branch(path, *_walk(path, points, interval, step, max_points, progress))
+
+
+def _start(x: np.ndarray, s: float, dx: np.ndarray, ds: float) -> Point:
+    """A point to start at, with its tangent, of the dtypes that a step returns, so that it is compiled once."""
+    count, residual, dtype = np.zeros((), np.int32), np.zeros((), x.dtype), x.dtype.type
+    return Point(x, dtype(s), dx.astype(x.dtype), dtype(ds), count, residual, count)
 
 
 def _check_way(
@@ -177,59 +172,65 @@ def _check_way(
     return (low, high), parameter, step
 
 
-def on_the_way(scene: Scene, end: Any, s: Any) -> Any:
-    """The commands `rest + s (end - rest)`."""
-    rest = rest_commands(scene)
-    return rest + s * (end - rest)
-
-
-class Path(NamedTuple):
-    """The scenes whose equilibria are traced: those under the commands `rest + s (end - rest)`.
-
-    scene: any of them.
-    end: `(m,)` commands at `s = 1`.
-    layout: of their stiffness.
-    solver: tolerance and linear solver.
-    """
-
-    scene: Scene
-    end: np.ndarray
-    layout: Layout
-    solver: Newton
-
-    def scene_at(self, s: jax.Array | float) -> Scene:
-        return command(self.scene, self.commands_at(s))
-
-    def commands_at(self, s: Any) -> Any:
-        """The commands `(..., m)` at parameters `s` `()` or `(P, 1)`."""
-        return on_the_way(self.scene, self.end, s)
-
-    def advance(self, here: Point, length: float) -> Point:
-        """The point of the branch at arclength `length` along the tangent of `here`."""
-        arclength = here.s.dtype.type(length)
-        return jax.device_get(_advance(unlock(self.scene), self.layout, self.end, here, arclength, self.solver))
-
-
-def _first_state(path: Path, parameter: float, x0: Numbers | None) -> jax.Array:
+def _first_state(path: Path, parameter: float, x0: Numbers | None) -> np.ndarray:
     """The equilibrium `(n, 2)` to start at."""
     found = equilibrium(path.scene_at(parameter), x0, dataclasses.replace(path.solver, escape=False))
     # A branch may start at a saddle, at a critical point, or where the body overlaps itself.
     if found.status & (Status.NOT_CONVERGED | Status.NONFINITE | Status.INVALID):
         check(found)
-    return found.x
+    return np.asarray(found.x)
+
+
+def _check_bifurcation(through: Critical, x0: Numbers | None, parameter: float) -> float:
+    """The parameter of a bifurcation to start at."""
+    checks.instance("through", through, Critical, "give one of branch.critical")
+    if through.kind != "bifurcation":
+        raise ValueError(f"through: expected a bifurcation, got a {through.kind}, at which no other branch crosses")
+    if x0 is not None or parameter != 0:
+        raise ValueError("through: expected neither x0 nor parameter beside it, because the branch starts at its point")
+    return through.parameter
+
+
+def _beside(path: Path, fork: Critical, direction: int, step: float) -> list[Point]:
+    """A bifurcation, and the first point beside it on the branch that crosses there.
+
+    The tangent of that branch lies in the plane of the traced branch's tangent and of the mode. The point is looked for
+    in the direction of this plane that is normal to the traced branch, so that the traced branch is not found again.
+
+    Raises:
+        EquilibriumError: if no point is found.
+    """
+    x = np.asarray(fork.x)
+    weight = 1 / (x.size * float(extent(path.start)) ** 2)
+    mode, (dx, ds) = np.asarray(fork.shape, x.dtype), fork.tangent
+    dot = weight * np.sum(mode * dx) / (weight * np.sum(dx**2) + ds**2)
+    away, ds_away = mode - dot * dx, -dot * ds
+    scale = direction / np.sqrt(weight * np.sum(away**2) + ds_away**2)
+    here = _start(x, fork.parameter, scale * away, scale * ds_away)
+    length, tolerance = step, path.solver.tolerance(x.dtype)
+    while length > 1e-4 * step:
+        point = path.advance(here, length)
+        offset = weight * np.sum((point.x - x - length * here.dx) ** 2) + (point.s - here.s - length * here.ds) ** 2
+        if point.residual <= tolerance and offset <= length**2:
+            residual = x.dtype.type(fork.residual)
+            return [here._replace(negative=point.negative, residual=residual), point]
+        length /= 2
+    raise EquilibriumError(
+        "through: no state of another branch was found beside the bifurcation; trace with a smaller step, or start "
+        "from x0 = through.x + a little of through.shape"
+    )
 
 
 def _walk(
     path: Path,
-    first: Point,
+    points: list[Point],
     interval: tuple[float, float],
     step: float,
     max_points: int,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[list[Point], list[Critical], str]:
-    """The points from `first` on, the critical points between them, and why the walk ended (as in `Branch`)."""
-    tolerance, size = path.solver.tolerance(first.x.dtype), float(extent(path.scene))
-    points, length = [first], step
+    """All points from the first ones on, critical points between them, and why the walk ended (as in `Branch`)."""
+    tolerance, size, length = path.solver.tolerance(points[0].x.dtype), float(extent(path.start)), step
     critical: list[Critical] = []
     while len(points) < max_points:
         old, new = points[-1], path.advance(points[-1], length)
@@ -262,10 +263,10 @@ def _branch(path: Path, points: list[Point], critical: list[Critical], ended: st
     """
     stack = lambda name: np.stack([getattr(point, name) for point in points])
     s, x = stack("s"), stack("x")
-    smallest, overlapping = jax.device_get(_looked_at(path.scene, x))
+    smallest, overlapping = jax.device_get(_looked_at(path.start, x))
     return Branch(
         parameter=s,
-        ratios=np.asarray(path.commands_at(s[:, None])),
+        ratios=path.commands_at(s),
         x=x,
         negative=stack("negative"),
         residual=stack("residual"),
@@ -297,55 +298,6 @@ def _strays(old: Point, new: Point, length: float, size: float) -> bool:
     return bool((np.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
 
 
-@compiled("solver")
-def _advance(scene: Scene, layout: Layout, end: jax.Array, here: Point, length: jax.Array, solver: Newton) -> Point:
-    """The point of the branch at arclength `length` along the tangent of `here`."""
-    rtol = solver.tolerance(here.x.dtype)
-    # Weight of the inner product of displacements: their mean square, over the square of the body's size.
-    weight = 1 / (here.x.size * extent(scene) ** 2)
-
-    def linearise(x: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """The Newton step at fixed `s`, the derivative of the positions in `s`, the residual, and the inertia."""
-        scene_at = lambda s: command(scene, on_the_way(scene, end, s))
-        at = evaluate(scene_at(s), x)
-        hessians = stencil_hessians(scene_at(s), x)
-        storage = assemble(layout, hessians)
-        rate = jax.jvp(lambda s: evaluate(scene_at(s), x).gradient, (s,), (jnp.ones_like(s),))[1]
-        factor, negative = solver.linear.factor_indefinite(layout, storage)
-        gradient = gather(layout, at.gradient)
-        solve = lambda v: expand(layout, -solver.linear.solve_indefinite(layout, factor, v), x.shape)
-        residual = relative_residual(scene, at, force_round_off(row_magnitudes(scene, hessians), x), rtol)
-        return solve(gradient), solve(gather(layout, rate)), residual, negative
-
-    def correct(carry: tuple[Point, jax.Array]) -> tuple[Point, jax.Array]:
-        """One Newton step of the corrector, unless the point has converged; and whether it has."""
-        point, _ = carry
-        balance, along, residual, negative = linearise(point.x, point.s)
-        miss = weight * jnp.sum(here.dx * (point.x - here.x)) + here.ds * (point.s - here.s) - length
-        ds = -(miss + weight * jnp.sum(here.dx * balance)) / (here.ds + weight * jnp.sum(here.dx * along))
-        norm = jnp.sqrt(weight * jnp.sum(along**2) + 1)
-        sign = jnp.sign(here.ds + weight * jnp.sum(here.dx * along))
-        done = (residual <= rtol) & (jnp.abs(miss) <= 1e-6 * jnp.abs(length) + jnp.finfo(length.dtype).eps * 100)
-        moved = Point(
-            x=jnp.where(done, point.x, point.x + balance + ds * along),
-            s=jnp.where(done, point.s, point.s + ds),
-            dx=sign * along / norm,
-            ds=sign / norm,
-            negative=negative,
-            residual=residual,
-            corrections=point.corrections + ~done,
-        )
-        return moved, done
-
-    guess = Point(
-        here.x + length * here.dx, here.s + length * here.ds, here.dx, here.ds,
-        jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, here.x.dtype), jnp.zeros((), jnp.int32),
-    )  # fmt: skip
-    going = lambda carry: ~carry[1] & (carry[0].corrections <= MAX_CORRECTIONS)
-    point, done = lax.while_loop(going, correct, (guess, jnp.asarray(False)))
-    return point._replace(residual=jnp.where(done, point.residual, jnp.inf))
-
-
 def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Critical:
     """The critical point between two neighbours: where, along the branch, an eigenvalue changes sign.
 
@@ -365,7 +317,7 @@ def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Cr
         modes = lowest_mode(path.scene_at(point.s), point.x, which + 1, path.solver)
         return float(modes.values[which]), modes.shapes[which]
 
-    low, high = 0.0, length
+    low, high, middle = 0.0, length, length
     point, (f_low, _), (f_high, shape) = new, eigen(old), eigen(new)
     scale, side, value = max(abs(f_low), abs(f_high)), 0, f_high
     for _ in range(60):
@@ -382,6 +334,16 @@ def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Cr
             low, f_low = middle, value
             f_high *= 0.5 if side == -1 else 1.0
             side = -1
-    ratios = np.asarray(path.commands_at(point.s))
-    kind = "fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation"
-    return Critical(kind, float(point.s), ratios, jnp.asarray(point.x), shape, value, after)
+    share = middle / length
+    dx, ds = ((1 - share) * a + share * b for a, b in ((old.dx, new.dx), (old.ds, new.ds)))
+    return Critical(
+        kind="fold" if float(old.ds) * float(new.ds) < 0 else "bifurcation",
+        parameter=float(point.s),
+        ratios=path.commands_at(point.s[None])[0],
+        x=jnp.asarray(point.x),
+        shape=shape,
+        eigenvalue=value,
+        after=after,
+        residual=float(point.residual),
+        tangent=(dx, float(ds)),
+    )

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 
 from jaxbeam.core.compiling import compiled
 from jaxbeam.linear.layout import Layout, LinearSolver, expand, gather
-from jaxbeam.scene.scene import Scene, command
+from jaxbeam.scene.scene import Scene, at_places, command, has_supports
 from jaxbeam.solve.implicit import energy_gradient
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
@@ -60,8 +60,9 @@ def expand_measure(
         linear: the linear solver that made the factor.
     """
     m = theta.size
-    outcome = lambda theta, x: jnp.ravel(measure(command(scene, theta), x))
-    unbalanced = lambda theta, x: energy_gradient(command(scene, theta), x)
+    placed = lambda theta, x: at_places(command(scene, theta), x)
+    outcome = lambda theta, x: jnp.ravel(measure(command(scene, theta), placed(theta, x)))
+    unbalanced = lambda theta, x: energy_gradient(command(scene, theta), placed(theta, x))
 
     dg_dtheta = jax.jacfwd(unbalanced)(theta, x)
     dq_dx = jnp.moveaxis(jax.jacrev(outcome, argnums=1)(theta, x), 0, -1)
@@ -69,6 +70,8 @@ def expand_measure(
     rhs = columns(partial(gather, layout))(jnp.concatenate([dg_dtheta, dq_dx], axis=-1))
     moved = columns(lambda v: expand(layout, v, x.shape))(-linear.solve(layout, factor, rhs))
     drift, price = moved[..., :m], moved[..., m:]
+    if has_supports(scene):
+        drift += jax.jacfwd(placed)(theta, x)
 
     def along(step: jax.Array) -> jax.Array:
         return outcome(theta + step, x + drift @ step)

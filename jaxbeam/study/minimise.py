@@ -13,8 +13,8 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
+from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene
-from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver
 from jaxbeam.solve.solution import Solution

@@ -26,7 +26,8 @@ from jax import lax
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import pytree, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble
-from jaxbeam.scene.scene import Scene, command, command_units, rest_commands, stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
+from jaxbeam.scene.scene import Scene, command, command_units, rest_commands
 from jaxbeam.solve.equilibrium import differentiable
 from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton

@@ -16,8 +16,8 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import is_outermost, usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device
 from jaxbeam.scene.measures import tip_angle
+from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene, command_count, command_units, commanded_terms, rest_commands
-from jaxbeam.scene.supports import check_held
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure

@@ -20,7 +20,8 @@ from jaxbeam.core.compiling import usual_rules, zeros_like_result
 from jaxbeam.core.derivative import custom_derivative
 from jaxbeam.core.tree import Numbers, is_concrete, pytree, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand
-from jaxbeam.scene.scene import Scene, placed, stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
+from jaxbeam.scene.scene import Scene, placed
 from jaxbeam.solve.implicit import energy_gradient
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 
@@ -66,7 +67,7 @@ def lowest_mode(scene: Scene, x: Numbers, count: int = 1, solver: Newton = Newto
         ValueError: if `count` is not between 1 and the number of free coordinates, or `x` has another shape.
     """
     check_scene_and_solver(scene, solver)
-    checks.count("count", count, 1, int(np.sum(~scene.fixed)), "the free coordinates")
+    checks.count("count", count, 1, int(np.sum(~scene.held)), "the free coordinates")
     x = placed(scene, x)
     layout = solver.linear.layout(topology(scene))
     x = x.astype(scene.mesh.nodes.dtype)
@@ -109,7 +110,7 @@ def _follow_modes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
     def moved(shape: jax.Array, simple: jax.Array) -> tuple[jax.Array, jax.Array]:
         product = lambda scene, x: jax.jvp(partial(energy_gradient, scene), (x,), (shape,))[1]
-        change = jnp.where(scene.fixed, 0, jax.jvp(product, (scene, x), tangents[:2])[1])
+        change = jnp.where(scene.held, 0, jax.jvp(product, (scene, x), tangents[:2])[1])
         return jnp.sum(shape * _unless(simple, change)), _unless(jnp.asarray(False), change)
 
     return (values, shapes), jax.vmap(moved)(shapes, simple)

@@ -24,7 +24,7 @@ from jaxbeam.core.tree import Key
 from jaxbeam.linear.blocks import Topology
 from jaxbeam.linear.layout import assemble, expand, gather
 from jaxbeam.physics.projection import project_each, project_many
-from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
 from jaxbeam.solve.newton import topology
 
 # ----------------------------------------------------------------------------------------- projection

@@ -13,7 +13,8 @@ from jaxbeam import plot
 from jaxbeam.core.tree import replace
 from jaxbeam.physics.tendon import polyline_length
 from jaxbeam.plot.lines import line_names
-from jaxbeam.scene.scene import commands_of, is_valid, largest_step, partway, rest_commands, worst_element
+from jaxbeam.scene.evaluation import largest_step, worst_element
+from jaxbeam.scene.scene import commands_of, is_valid, partway, rest_commands
 
 BEAM = jb.tendon_beam(5, 3)
 
@@ -111,7 +112,7 @@ def test_it_is_drawn_under_its_own_name():
 class RefinableWire(Wire):
     """The same, tied to nodes that a finer mesh has too."""
 
-    def refined(self, term, mesh, parts):
+    def refined(self, term, mesh, finer):
         return term
 
 

@@ -11,8 +11,9 @@ import jaxbeam as jb
 from jaxbeam.mesh.line import Line, straight
 from jaxbeam.physics.rod import fibre_energy, rod, shear_modulus
 from jaxbeam.physics.rod_tendon import rod_tendons
-from jaxbeam.scene.scene import is_valid, smallest_jacobian
-from jaxbeam.scene.supports import check_held
+from jaxbeam.scene.evaluation import smallest_jacobian
+from jaxbeam.scene.rigid import check_held
+from jaxbeam.scene.scene import is_valid
 
 smallest = jax.jit(smallest_jacobian)
 MU, LAM = 3.0, 7.0

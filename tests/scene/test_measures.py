@@ -7,7 +7,7 @@ import pytest
 from helpers import affine, rotation, small_beam
 
 import jaxbeam as jb
-from jaxbeam.scene.scene import smallest_jacobian
+from jaxbeam.scene.evaluation import smallest_jacobian
 
 UNIT = jb.rectangle(2.0, 1.0, 3, 2)
 BODY = jb.solid(UNIT, jb.lame(10.0, 0.3))

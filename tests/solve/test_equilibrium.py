@@ -9,7 +9,7 @@ from helpers import PAIR_NODES, affine, macneal_harder, small_beam, spring_pair,
 import jaxbeam as jb
 from jaxbeam.core.tree import unlock
 from jaxbeam.linear.layout import assemble
-from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
 from jaxbeam.solve.newton import Policy, newton, topology
 
 # Converged answers of two independent codes: ratios, tip angle in degrees and lengths of the tendons where known.

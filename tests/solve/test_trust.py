@@ -11,7 +11,7 @@ from jaxbeam.linear.layout import assemble
 from jaxbeam.mesh.line import Line
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
-from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
 from jaxbeam.solve.newton import topology
 from jaxbeam.solve.stiffness import SOFT_PIVOT, largest_diagonal
 

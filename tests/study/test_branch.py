@@ -9,7 +9,7 @@ import pytest
 from helpers import assembled, spring_pair
 
 import jaxbeam as jb
-from jaxbeam.scene.scene import evaluate, stencil_hessians
+from jaxbeam.scene.evaluation import evaluate, stencil_hessians
 from jaxbeam.solve.newton import topology
 
 END = np.array([0.3, 0.3])

@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.core.tree import Key
 from jaxbeam.linear.blocks import Topology
 from jaxbeam.linear.layout import assemble, expand, gather
-from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
 from jaxbeam.solve.newton import topology
 
 LONG = jb.rectangle(4.0, 1.0, 9, 3)

@@ -9,7 +9,7 @@ import jaxbeam as jb
 from jaxbeam.mesh.line import straight
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
-from jaxbeam.scene.supports import check_held
+from jaxbeam.scene.rigid import check_held
 
 ROTATION = r"fixed: the body is not held, it moves rigidly without resistance: rotation about \(-1.75, -0.4\)"
 

@@ -73,13 +73,13 @@ def check_held(scene: Scene) -> None:
     Raises:
         ValueError: if a piece is not held; it names the piece and its free motions.
     """
-    known = is_concrete(scene.mesh.elements, scene.fixed)
-    if known and _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "fixed")):
+    known = is_concrete(scene.mesh.elements, scene.held)
+    if known and _clamps_suffice(key_of(scene.mesh, "elements"), key_of(scene, "held")):
         return
     if not is_concrete(*jax.tree.leaves(scene)):
         return
     rigid = _rigid_motions(scene)
-    _, values, basis = np.linalg.svd(rigid.slope[scene.fixed], full_matrices=True)
+    _, values, basis = np.linalg.svd(rigid.slope[scene.held], full_matrices=True)
     free = basis[np.sum(values > 1e-9) :].T
     others = tuple(term for term in scene.terms if not term.kind.body)
     if free.shape[1] and others:
@@ -138,10 +138,10 @@ def _unresisted(scene: Scene, rigid: Rigid, free: np.ndarray) -> np.ndarray:
     second, slope = (np.sum(parts, axis=0) for parts in ([f.second for f in found], [f.slope for f in found]))
     noise = sum(f.noise for f in found)
     # A fixed coordinate must not move to second order either. Its reaction acts like a load on a moving node.
-    reactions = np.linalg.lstsq(rigid.slope[scene.fixed].T, slope)[0]
-    turns = 3 * rigid.piece[np.nonzero(scene.fixed)[0]] + 2
-    np.add.at(second, (turns, turns), -reactions * rigid.bend[scene.fixed])
-    noise += NOISE * eps * float(np.abs(reactions) @ np.abs(rigid.bend[scene.fixed]))
+    reactions = np.linalg.lstsq(rigid.slope[scene.held].T, slope)[0]
+    turns = 3 * rigid.piece[np.nonzero(scene.held)[0]] + 2
+    np.add.at(second, (turns, turns), -reactions * rigid.bend[scene.held])
+    noise += NOISE * eps * float(np.abs(reactions) @ np.abs(rigid.bend[scene.held]))
     values, vectors = np.linalg.eigh(free.T @ second @ free)
     return free @ vectors[:, np.abs(values) <= noise]
 
