@@ -27,6 +27,10 @@ from jaxbeam.solve.solution import EquilibriumError, Status, check
 from jaxbeam.study.arclength import Path, Point, path_between
 from jaxbeam.study.stability import lowest_mode
 
+# A crossing branch is looked for at this arclength from its bifurcation, over the length of a step, and may deviate from
+# the normal of the traced branch by this slope.
+BESIDE = 1e-3
+SLANT = 50.0
 # The next step may be longer only after one that took at most this many corrections.
 EASY = 4
 
@@ -137,7 +141,7 @@ def trace_branch(
     """
     check_scene_and_solver(scene, solver)
     if through is not None:
-        parameter = _check_bifurcation(through, x0, parameter)
+        parameter = _check_bifurcation(scene, through, x0, parameter)
     interval, parameter, step = _check_way(direction, interval, parameter, step)
     checks.count("max_points", max_points, 1)
     if not isinstance(end, Scene):
@@ -181,11 +185,14 @@ def _first_state(path: Path, parameter: float, x0: Numbers | None) -> np.ndarray
     return np.asarray(found.x)
 
 
-def _check_bifurcation(through: Critical, x0: Numbers | None, parameter: float) -> float:
+def _check_bifurcation(scene: Scene, through: Critical, x0: Numbers | None, parameter: float) -> float:
     """The parameter of a bifurcation to start at."""
     checks.instance("through", through, Critical, "give one of branch.critical")
     if through.kind != "bifurcation":
         raise ValueError(f"through: expected a bifurcation, got a {through.kind}, at which no other branch crosses")
+    if through.x.shape != scene.mesh.nodes.shape:
+        shapes = f"shape {scene.mesh.nodes.shape}, got {through.x.shape}"
+        raise ValueError(f"through: expected positions of this scene, {shapes}; give a point of a branch of it")
     if x0 is not None or parameter != 0:
         raise ValueError("through: expected neither x0 nor parameter beside it, because the branch starts at its point")
     return through.parameter
@@ -195,7 +202,8 @@ def _beside(path: Path, fork: Critical, direction: int, step: float) -> list[Poi
     """A bifurcation, and the first point beside it on the branch that crosses there.
 
     The tangent of that branch lies in the plane of the traced branch's tangent and of the mode. The point is looked for
-    in the direction of this plane that is normal to the traced branch, so that the traced branch is not found again.
+    in the direction of this plane that is normal to the traced branch, and near, because the traced branch is found
+    again only where its bend leads as far: a distance of the order of the root.
 
     Raises:
         EquilibriumError: if no point is found.
@@ -207,11 +215,11 @@ def _beside(path: Path, fork: Critical, direction: int, step: float) -> list[Poi
     away, ds_away = mode - dot * dx, -dot * ds
     scale = direction / np.sqrt(weight * np.sum(away**2) + ds_away**2)
     here = _start(x, fork.parameter, scale * away, scale * ds_away)
-    length, tolerance = step, path.solver.tolerance(x.dtype)
-    while length > 1e-4 * step:
+    length, tolerance = BESIDE * step, path.solver.tolerance(x.dtype)
+    while length > 1e-3 * BESIDE * step:
         point = path.advance(here, length)
         offset = weight * np.sum((point.x - x - length * here.dx) ** 2) + (point.s - here.s - length * here.ds) ** 2
-        if point.residual <= tolerance and offset <= length**2:
+        if point.residual <= tolerance and offset <= (SLANT * length) ** 2:
             residual = x.dtype.type(fork.residual)
             return [here._replace(negative=point.negative, residual=residual), point]
         length /= 2
@@ -295,7 +303,8 @@ def _strays(old: Point, new: Point, length: float, size: float) -> bool:
     weight = 1 / (new.x.size * size**2)
     offset = weight * np.sum((new.x - old.x - length * old.dx) ** 2) + (new.s - old.s - length * old.ds) ** 2
     cosine = weight * np.sum(new.dx * old.dx) + new.ds * old.ds
-    return bool((np.sqrt(offset) > MAX_OFFSET * length) | (cosine < MIN_COSINE))
+    # Exactly at a critical point the tangent may be NaN: then a shorter step is taken too.
+    return not (np.sqrt(offset) <= MAX_OFFSET * length and cosine >= MIN_COSINE)
 
 
 def _locate(path: Path, old: Point, new: Point, length: float, after: int) -> Critical:
