@@ -27,7 +27,7 @@ from jaxbeam.solve.solution import EquilibriumError, Status, check
 from jaxbeam.study.arclength import Path, Point, path_between
 from jaxbeam.study.stability import lowest_mode
 
-# A crossing branch is looked for at this arclength from its bifurcation, over the length of a step, and may deviate from
+# A crossing branch is looked for at this arclength from its bifurcation, over the length of a step. It may deviate from
 # the normal of the traced branch by this slope.
 BESIDE = 1e-3
 SLANT = 50.0
