@@ -279,7 +279,7 @@ def _check_outside(mesh: Mesh, term: Term) -> None:
             f"it at rest; place it outside, and move it in by its command"
         )
     stride, longest = term.params.stride, float(np.sum(np.asarray(term.params.lengths), axis=1).max())
-    if stride is not None and 4 * float(stride[0]) < longest:
+    if stride is not None and 4 * float(stride[0]) < (1 - 1e-6) * longest:
         raise ValueError(
             f"obstacle: its thickness is {4 * float(stride[0]):.3g}, less than the longest edge that may touch it, "
             f"{longest:.3g}, between whose points it could pass; refine the mesh there"

@@ -10,7 +10,7 @@ import pytest
 from helpers import assembled
 
 import jaxbeam as jb
-from jaxbeam.scene.scene import stencil_hessians
+from jaxbeam.scene.evaluation import stencil_hessians
 from jaxbeam.solve.newton import topology
 
 MESH = jb.rectangle(2.0, 1.0, 5, 3, "crossed", order=2)
