@@ -175,6 +175,12 @@ def namespace(*values: Any) -> Any:
     return np if is_concrete(*values) else jnp
 
 
+def spread(values: Any, like: Any) -> Any:
+    """`values` in the dtype and the shape of `like`: one command for all stencils of a term."""
+    xp = namespace(values)
+    return xp.broadcast_to(xp.asarray(values, like.dtype), like.shape)
+
+
 def to_device(values: Any, dtype: Any = None) -> Any:
     """Plain numbers or a JAX array as a JAX array of `dtype`, by default of JAX's own dtype for them.
 

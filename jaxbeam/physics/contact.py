@@ -28,7 +28,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, spread, static_field
 from jaxbeam.mesh.element import edge_functions, edge_rule, edge_slopes
 from jaxbeam.mesh.mesh import Mesh, check_triangles
 from jaxbeam.mesh.refinement import Finer
@@ -60,12 +60,18 @@ class Obstacle:
 
 def half_plane(point: Numbers, normal: Numbers) -> Obstacle:
     """All points behind the line through `point` `(2,)`. `normal` `(2,)`, of any length, points out of it."""
-    xp = namespace(point, normal)
-    away = xp.asarray(checks.numbers("normal", normal, shapes=((2,),)))
-    length = xp.sqrt(xp.sum(away**2))
+    place = namespace(point).asarray(checks.numbers("point", point, shapes=((2,),)))
+    return Obstacle(_behind_line, (place, _unit("normal", normal)))
+
+
+def _unit(name: str, vector: Numbers) -> Any:
+    """The unit vector `(2,)` along a vector of any length but 0."""
+    xp = namespace(vector)
+    along = xp.asarray(checks.numbers(name, vector, shapes=((2,),)))
+    length = xp.sqrt(xp.sum(along**2))
     if is_concrete(length) and not length > 0:
-        raise ValueError("normal: expected a vector of positive length, got [0, 0]")
-    return Obstacle(_behind_line, (xp.asarray(checks.numbers("point", point, shapes=((2,),))), away / length))
+        raise ValueError(f"{name}: expected a vector of positive length, got [0, 0]")
+    return along / length
 
 
 def disk(centre: Numbers, radius: Numbers) -> Obstacle:
@@ -163,8 +169,7 @@ class ContactEnergy(Energy):
         return jnp.asarray(edge_functions(len(x), xi), x.dtype) @ x - params.moved * params.direction
 
     def command(self, params: ContactParams, values: jax.Array) -> ContactParams:
-        xp = namespace(values)
-        return replace(params, moved=xp.broadcast_to(xp.asarray(values, params.moved.dtype), params.moved.shape))
+        return replace(params, moved=spread(values, params.moved))
 
     def command_of(self, params: ContactParams) -> jax.Array:
         return params.moved[:1]
@@ -240,8 +245,7 @@ def contact(
     checks.instance("obstacle", obstacle, Obstacle, "make one with half_plane, disk or box")
     numbers = [checks.number("stiffness", stiffness, checks.POSITIVE)]
     numbers.append(checks.number("transition", transition, checks.POSITIVE))
-    toward = checks.numbers("direction", direction, shapes=((2,),))
-    xp, dtype, count = namespace(toward), mesh.nodes.dtype, len(edges)
+    toward, dtype, count = _unit("direction", direction), mesh.nodes.dtype, len(edges)
     every = lambda value: namespace(value).broadcast_to(
         namespace(value).asarray(value, dtype), (count, *np.shape(value))
     )
@@ -251,7 +255,7 @@ def contact(
         stiffness=every(numbers[0]),
         transition=every(numbers[1]),
         moved=every(0.0),
-        direction=every(xp.asarray(toward) / xp.sqrt(xp.sum(xp.asarray(toward) ** 2))),
+        direction=every(toward),
         stride=None if obstacle.stride is None else every(obstacle.stride),
     )
     term = Term(ContactEnergy(obstacle.distance), edges, params)

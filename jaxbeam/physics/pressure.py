@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace, pytree, replace
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace, spread
 from jaxbeam.mesh.element import edge_products
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
@@ -68,9 +68,7 @@ class PressureEnergy(Energy):
         return jnp.stack([along[..., 1], -along[..., 0]], axis=-1)
 
     def command(self, params: PressureParams, values: jax.Array) -> PressureParams:
-        xp = namespace(values)
-        pressure = xp.asarray(values, params.pressure.dtype)
-        return replace(params, pressure=xp.broadcast_to(pressure, params.pressure.shape))
+        return replace(params, pressure=spread(values, params.pressure))
 
     def command_of(self, params: PressureParams) -> jax.Array:
         return params.pressure[:1]

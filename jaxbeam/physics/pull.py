@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, index_field, namespace, pytree, replace, to_device
+from jaxbeam.core.tree import Numbers, index_field, namespace, pytree, replace, spread, to_device
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Term
@@ -51,9 +51,7 @@ class PullEnergy(LineEnergy):
         return params.tension
 
     def command(self, params: PullParams, values: jax.Array) -> PullParams:
-        xp = namespace(values)
-        tension = xp.broadcast_to(xp.asarray(values, params.tension.dtype), params.tension.shape)
-        return replace(params, tension=to_device(tension))
+        return replace(params, tension=to_device(spread(values, params.tension)))
 
     def command_of(self, params: PullParams) -> jax.Array:
         return params.tension[:1] if self.shared_command else params.tension

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace, pytree, replace
+from jaxbeam.core.tree import Numbers, namespace, pytree, replace, spread
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer, heirs
 from jaxbeam.physics.energy import Energy, Term, check_nodes
@@ -53,8 +53,7 @@ class SupportEnergy(Energy):
         return (params.moved[:, None] * params.motion)[:, None]
 
     def command(self, params: SupportParams, values: jax.Array) -> SupportParams:
-        xp = namespace(values)
-        return replace(params, moved=xp.broadcast_to(xp.asarray(values, params.moved.dtype), params.moved.shape))
+        return replace(params, moved=spread(values, params.moved))
 
     def command_of(self, params: SupportParams) -> jax.Array:
         return params.moved[:1]

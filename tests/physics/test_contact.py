@@ -216,6 +216,8 @@ def test_a_users_own_shape_and_an_error_bar():
 
 
 def test_bad_obstacles_are_refused():
+    with pytest.raises(ValueError, match="direction: expected a vector of positive length"):
+        jb.contact(jb.rectangle(1.0, 1.0, 3, 3), [0, 3, 6], jb.disk([0.0, -2.0], 0.5), 1.0, 0.1, direction=[0.0, 0.0])
     mesh = jb.rectangle(3.5, 0.8, 9, 3)
     below = jb.nodes_where(mesh, lambda x, y: y < -0.3999)
     with pytest.raises(ValueError, match=r"lies 0.1 inside it at rest; place it outside"):
