@@ -111,13 +111,13 @@ def line(mesh: jb.Mesh) -> list[int]:
 
 
 def middle(scene: jb.Scene, x: jax.Array) -> jax.Array:
-    """Height of the middle of the upper side."""
-    return x[jb.nearest_node(scene.mesh, [0.0, 0.4])][1]
+    """Height of the tip, here the middle of the upper side."""
+    return jb.tip_position(scene, x)[1]
 
 
 def push(scene: jb.Scene, x: jax.Array) -> jax.Array:
     """Force of the support in y."""
-    return jb.reactions(scene, x)[end(scene.mesh), 1].sum()
+    return jb.reactions(scene, x)[scene.tip, 1].sum()
 
 
 def touch(scene: jb.Scene, x: jax.Array) -> jax.Array:
@@ -152,7 +152,8 @@ def solved(act: Act, strength: float, nx: int, ny: int, order: int) -> jb.ErrorE
     term, commands = act.term(mesh, strength)
     left = jb.nodes_where(mesh, lambda x, y: x == x.min())
     held = np.concatenate([left, end(mesh)]) if act.both_ends else left
-    scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e4, 0.45)), term), jb.clamped(mesh, held), end(mesh))
+    tip = [jb.nearest_node(mesh, [0.0, 0.4])] if act.both_ends else end(mesh)
+    scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e4, 0.45)), term), jb.clamped(mesh, held), tip)
     scene = jb.command(scene, commands)
     return jb.estimate_error(scene, jb.equilibrium(scene), act.measure)
 

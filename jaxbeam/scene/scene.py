@@ -208,7 +208,10 @@ def command(scene: Scene, commands: Numbers) -> Scene:
 
 def checked_commands(name: str, scene: Scene, commands: Numbers) -> Any:
     """Commands `(m,)` of a scene as numbers; refused if their count is wrong, or as `check_commands` does."""
-    values = checks.shaped(name, commands, ((command_count(scene),),), "one for each tendon")
+    kinds = [(term.command_count, term.kind.name) for term in commanded_terms(scene)]
+    only_tendons = all(kind == "tendon" for _, kind in kinds)
+    each = "one for each tendon" if only_tendons else "for " + ", ".join(f"{count} x {kind}" for count, kind in kinds)
+    values = checks.shaped(name, commands, ((command_count(scene),),), each)
     check_commands(name, scene, values)
     return values
 

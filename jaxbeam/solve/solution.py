@@ -75,7 +75,7 @@ class Solution:
         without either.
     worst_element: `()` number of the element where that is; -1 without either.
     crossing: `(2, 2)` int32, two edges of the surface that cross, each by the numbers of its end nodes; -1 if none do.
-    ratios: `(m,)` commanded ratio of each tendon.
+    ratios: `(m,)` commands in the order of the terms: ratios of tendons, tensions, pressures and others.
     reached: `()` fraction of the way to the command that was covered: 1 at the command itself. If it is less, `x` is
         the equilibrium at that fraction of the way.
     status: `()` int32 of or-ed `Status` flags; 0 is `OK`.

@@ -254,3 +254,9 @@ def test_a_scene_without_supports_traces_nothing_of_them(monkeypatch):
     plain = jb.tendon_beam(5, 3)
     jax.clear_caches()
     assert jb.equilibrium(jb.command(plain, [0.9, 1.0])).status == 0
+
+
+def test_the_message_about_commands_counts_each_kind():
+    scene = gripped(jb.support(MESH, RIGHT, x=1.0), jb.cables(MESH, [[0, 9], [2, 11]], 1.0))
+    with pytest.raises(ValueError, match=r"ratios: expected shape \(3,\), for 1 x support, 2 x cable, got \(2,\)"):
+        jb.command(scene, [1.0, 1.0])
