@@ -96,7 +96,7 @@ class Branch:
 @usual_rules
 def trace_branch(
     scene: Scene,
-    end: Numbers | Scene,
+    ratios: Numbers | Scene,
     *,
     x0: Numbers | None = None,
     parameter: float = 0.0,
@@ -116,9 +116,9 @@ def trace_branch(
 
     Args:
         scene: with `m` commands.
-        end: commands `(m,)` at `s = 1`. They grow from those at rest (ratio 1 of tendons) at `s = 0`, and all else
+        ratios: commands `(m,)` at `s = 1`. They grow from those at rest (ratio 1 of tendons) at `s = 0`, and all else
             stays as in `scene`. Or another scene, such as the same one under a larger load: then all numbers in which
-            the two differ change in proportion, from `scene` at `s = 0` to `end` at `s = 1`.
+            the two differ change in proportion, from `scene` at `s = 0` to it at `s = 1`.
         x0: `(n, 2)` positions of the start: an equilibrium, or near one; by default the rest positions.
         parameter: `s` of the start.
         through: a bifurcation at which to start, in place of `x0` and `parameter`. Its branch ends there: to follow
@@ -135,7 +135,7 @@ def trace_branch(
         A `Branch`.
 
     Raises:
-        ValueError: as `command` does, if an argument is out of its range, if `end` is a scene with other terms or
+        ValueError: as `command` does, if an argument is out of its range, if `ratios` is a scene with other terms or
             nodes, or if `through` is not a bifurcation or given together with `x0` or `parameter`.
         EquilibriumError: if there is no equilibrium at the start, or no other branch is found at the bifurcation.
     """
@@ -144,9 +144,10 @@ def trace_branch(
         parameter = _check_bifurcation(scene, through, x0, parameter)
     interval, parameter, step = _check_way(direction, interval, parameter, step)
     checks.count("max_points", max_points, 1)
-    if not isinstance(end, Scene):
-        scene, end = command(scene, rest_commands(scene)), command(scene, end)
-    path = path_between(scene, end, solver)
+    if isinstance(ratios, Scene):
+        path = path_between(scene, ratios, solver)
+    else:
+        path = path_between(command(scene, rest_commands(scene)), command(scene, ratios), solver)
     if through is None:
         x = _first_state(path, parameter, x0)
         points = [path.advance(_start(x, parameter, np.zeros_like(x), direction), 0.0)]

@@ -123,5 +123,5 @@ def test_what_is_refused(mirrored):
         jb.trace_branch(rolling(1.0), rolling(-1.0), through=traced.critical[0], parameter=0.5)
     with pytest.raises(ValueError, match="through: expected positions of this scene"):
         jb.trace_branch(scene, [0.9, 0.9], through=traced.critical[0])
-    with pytest.raises(ValueError, match="end: expected commands, or a scene that differs"):
+    with pytest.raises(ValueError, match="ratios: expected commands, or a scene that differs"):
         jb.trace_branch(scene, mirrored)
