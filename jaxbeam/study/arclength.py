@@ -87,8 +87,8 @@ def path_between(start: Scene, end: Scene, solver: Newton) -> Path:
     """
     if len({jax.tree.structure(start), jax.tree.structure(end)}) > 1:
         raise ValueError(
-            "ratios: expected commands, or a scene that differs from `scene` in numbers alone, got one with other terms, "
-            "nodes or clamps; give both scenes all terms, such as a load of 0 in the first"
+            "ratios: expected commands, or a scene that differs from `scene` in numbers alone, got one with other "
+            "terms, nodes or clamps; give both scenes all terms, such as a load of 0 in the first"
         )
     pairs = zip(*(jax.tree.leaves(unlock(scene)) for scene in (start, end)), strict=True)
     changes = tuple(a is not b and not np.array_equal(a, b) for a, b in pairs)
