@@ -132,7 +132,7 @@ ACTS = {
     "pull": Act(lambda m, v: (jb.pulls(m, [line(m)], width=WIDTHS), [v]), (20.0, 100.0, 300.0)),
     "weight": Act(lambda m, v: (jb.weight(m, [0.0, -v]), []), (1.0, 10.0, 40.0)),
     "traction": Act(lambda m, v: (jb.traction(m, side(m, True), [0.0, -v]), []), (1.0, 10.0, 40.0)),
-    "pressure": Act(lambda m, v: (jb.pressure(m, side(m, True)), [v]), (50.0, 500.0, 1500.0), True, middle),
+    "pressure": Act(lambda m, v: (jb.pressure(m, side(m, True)), [v]), (50.0, 200.0, 600.0), True, middle),
     "contact": Act(lambda m, v: (jb.contact(m, side(m, False), DISK, 1e4, 0.01), [v]), (0.1, 0.3, 0.6)),
     "contact force": Act(
         lambda m, v: (jb.contact(m, side(m, False), DISK, 1e4, 0.01), [v]), (0.1, 0.3, 0.6), False, touch

@@ -207,7 +207,7 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
         # The value before the step differs from `value` too: a mean over the tip weighs other nodes on the finer mesh.
         change = step.value - value + step.total
     moved = step.x
-    if not np.isfinite(change):
+    if not np.isfinite(change) and solution.status == 0:
         # Newton steps without a line search failed, so solve the finer scene.
         found = equilibrium(finer, start, solver)
         moved, change = np.asarray(found.x), float(measure(finer, found.x)) - value if found.status == 0 else np.nan
