@@ -205,6 +205,11 @@ class ContactEnergy(Energy):
         params = jax.tree.map(lambda leaf: np.asarray(leaf)[parents], term.params)
         return Term(self, edges, replace(params, lengths=edge_lengths(mesh.nodes, edges, POINTS)))
 
+    def obstacle(self, points: jax.Array, params: ContactParams) -> jax.Array:
+        shape = jax.tree.map(lambda leaf: leaf[0], params.shape)
+        moved = params.moved[0] * params.direction[0]
+        return jax.vmap(self.distance, in_axes=(0, None))(points - moved, shape)
+
     def measured(self, x: jax.Array, params: ContactParams) -> dict[str, jax.Array]:
         gaps = jax.vmap(self.gaps)(x, params)
         return {

@@ -47,10 +47,9 @@ class DistributedParams:
 
 
 @dataclasses.dataclass(frozen=True)
-class WeightEnergy(Energy):
-    """`-force . sum_a shares_a (x_a - X_a)`: the potential of a constant force on the area of one element."""
+class DistributedEnergy(Energy):
+    """`-force . sum_a shares_a (x_a - X_a)`: the potential of a constant force on one element or edge."""
 
-    name: ClassVar[str] = "weight"
     coordinates: ClassVar[int | None] = 2
 
     def __call__(self, x: jax.Array, params: DistributedParams) -> jax.Array:
@@ -59,19 +58,36 @@ class WeightEnergy(Energy):
     def partway(self, params: DistributedParams, share: jax.Array) -> DistributedParams:
         return replace(params, force=share * params.force)
 
+
+@dataclasses.dataclass(frozen=True)
+class WeightEnergy(DistributedEnergy):
+    """The energy of a constant force on the area of one element."""
+
+    name: ClassVar[str] = "weight"
+
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         return weight(mesh, np.repeat(np.asarray(term.params.force), finer.parts, axis=0))
 
+    def point_loads(self, x: jax.Array, params: DistributedParams) -> jax.Array:
+        """The total weight, at the centre of gravity."""
+        heaviness = params.shares * jnp.linalg.norm(params.force, axis=1)[:, None]
+        whole = jnp.sum(heaviness)
+        centre = jnp.einsum("mk,mkd->d", heaviness, x) / jnp.where(whole > 0, whole, 1)
+        return jnp.stack([centre, jnp.einsum("mk,md->d", params.shares, params.force)])[None]
+
 
 @dataclasses.dataclass(frozen=True)
-class TractionEnergy(WeightEnergy):
-    """The same on the length of one edge of the surface."""
+class TractionEnergy(DistributedEnergy):
+    """The energy of a constant force on the length of one edge of the surface."""
 
     name: ClassVar[str] = "traction"
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
         return _on_edges(mesh, edges, np.asarray(term.params.force)[parents])
+
+    def edge_loads(self, x: jax.Array, params: DistributedParams, xi: np.ndarray) -> jax.Array:
+        return params.force
 
 
 @usual_rules

@@ -159,6 +159,31 @@ class Energy:
         """Nodes `(m, p)` and widths `(m, p)` of the patches of surface that it pulls on, to draw; None: none."""
         return None
 
+    def point_loads(self, x: jax.Array, params: Any) -> jax.Array | None:
+        """Outer forces to draw as arrows, `(q, 2, 2)`: for each the point where it acts, and the force; None: none."""
+        return None
+
+    def edge_loads(self, x: jax.Array, params: Any, xi: np.ndarray) -> jax.Array | None:
+        """Outer forces to draw as rows of arrows along edges of the surface; None: none.
+
+        Args:
+            x: of stencils that are edges: the two ends, with the body on the left, then the node between if any.
+            params: as above.
+            xi: `(m,)` one point on each edge, from 0 at its first end to 1.
+
+        Returns:
+            Force per length `(m, 2)` at these points.
+        """
+        return None
+
+    def obstacle(self, points: jax.Array, params: Any) -> jax.Array | None:
+        """Distance `(q,)` of points `(q, 2)` from a rigid obstacle to draw, negative inside it; None: there is none."""
+        return None
+
+    def springs(self, params: Any) -> jax.Array | None:
+        """Points `(m, 2)` to which springs tie the first node of each stencil, to draw; None: there are none."""
+        return None
+
 
 @dataclasses.dataclass(frozen=True)
 class BareFunction(Energy):

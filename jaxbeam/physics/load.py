@@ -43,6 +43,9 @@ class DeadLoadEnergy(Energy):
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         return term
 
+    def point_loads(self, x: jax.Array, params: PointParams) -> jax.Array:
+        return jnp.stack([x[:, 0, :2], params.value[:, :2]], axis=1)
+
 
 @usual_rules
 def dead_load(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, namespace, pytree, replace, spread
-from jaxbeam.mesh.element import edge_products
+from jaxbeam.mesh.element import edge_products, edge_slopes
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import edges_between, finer_edges
@@ -88,6 +88,11 @@ class PressureEnergy(Energy):
         count = len(edges)
         centre = jnp.broadcast_to(term.params.centre[0], (count, 2))
         return Term(self, edges, PressureParams(jnp.broadcast_to(term.params.pressure[0], (count,)), centre))
+
+    def edge_loads(self, x: jax.Array, params: PressureParams, xi: np.ndarray) -> jax.Array:
+        along = jnp.einsum("mk,mkd->md", jnp.asarray(edge_slopes(x.shape[1], xi), x.dtype), x)
+        inward = jnp.stack([-along[:, 1], along[:, 0]], axis=1)
+        return params.pressure[:, None] * inward / jnp.linalg.norm(inward, axis=1, keepdims=True)
 
 
 @usual_rules

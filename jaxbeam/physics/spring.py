@@ -32,6 +32,9 @@ class SpringEnergy(Energy):
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         return term
 
+    def springs(self, params: PointParams) -> jax.Array:
+        return params.rest[:, :2]
+
 
 @usual_rules
 def penalty_springs(mesh: Mesh, nodes: Numbers, stiffness: Numbers) -> Term:
