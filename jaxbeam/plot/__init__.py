@@ -4,9 +4,16 @@ Every function draws into the `ax` it is given or into a new `Figure`, and leave
 alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an animation with
 `save_animation`. Lengths, forces and stresses are in the user's units.
 
-A tendon that pulls is drawn solid and one that pushes dashed. The patch of surface that an anchor of finite width pulls
-on is a heavier line in the tendon's colour. A rod, whose nodes are `(n, 3)`, is drawn as its centre line. Colours are
-those of Okabe and Ito (2008), which survive colour blindness; several curves also differ in their markers.
+A tendon that pulls is drawn solid, one that pushes dashed, and a slack cable thin and pale. The patch of surface that
+an anchor of finite width pulls on is a heavier line in the tendon's colour. A rod, whose nodes are `(n, 3)`, is drawn
+as its centre line. Colours are those of Okabe and Ito (2008), which survive colour blindness; several curves also
+differ in their markers.
+
+Whatever acts on a body from outside is drawn, in the state that the picture shows. Forces on nodes and the total weight
+are arrows to one scale: the longest is a tenth of the body. Forces per length, such as traction and pressure, are rows
+of arrows outside the body, to a scale of their own. In an animation or a gallery the scales are those of all states. A
+rigid obstacle is grey, with a hatched rim; limits of axes hold it as far as it lies close to the body. Springs are
+zigzags that end outside the body.
 """
 
 from jaxbeam.plot.animations import animate_beams as animate_beams

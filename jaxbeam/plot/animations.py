@@ -12,8 +12,10 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, FuncAnimatio
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _fit, _legend, _panels, _prepare, _pushing, _ratios, limits
+from jaxbeam.plot.acting import Acting, to_one_scale
+from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _doing, _fit, _legend, _panels, _prepare, _ratios, limits
 from jaxbeam.plot.lines import extremes
+from jaxbeam.plot.loads import draw_acting
 from jaxbeam.plot.states import States
 from jaxbeam.plot.stills import curves
 from jaxbeam.scene.measures import tip_angle
@@ -40,7 +42,8 @@ def animate_ramp(
     """
     figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _prepare(left, limits(*extremes(states.scene, states.x)))
+    acting = [Acting(states.scene, states.x, states.commands)]
+    _prepare(left, limits(*extremes(states.scene, states.x), *acting[0].extremes()))
     curves([states], measure, label, ax=right)
     # The whole curve stays as a pale trace, so that the axes do not move, and one line on top of it grows.
     traced = []
@@ -54,7 +57,7 @@ def animate_ramp(
             line.set_data(*points[: frame + 1].T)
         head.set_data(*np.transpose([points[frame] for _, points in traced]))
 
-    return _play(figure, [left], [states], trace)
+    return _play(figure, [left], [states], acting, trace)
 
 
 def animate_beams(states: Sequence[States]) -> FuncAnimation:
@@ -70,9 +73,10 @@ def animate_beams(states: Sequence[States]) -> FuncAnimation:
         raise ValueError("states: expected at least one States, got none")
     if len({len(each) for each in states}) > 1:
         raise ValueError(f"states: expected as many states in each, got {[len(each) for each in states]}")
-    bounds = limits(*(points for each in states for points in extremes(each.scene, each.x)))
+    acting = to_one_scale([Acting(each.scene, each.x, each.commands) for each in states])
+    bounds = limits(*(points for each in acting for points in extremes(each.scene, each.x) + each.extremes()))
     figure, axes = _panels(len(states), [bounds])
-    return _play(figure, axes, states)
+    return _play(figure, axes, states, acting)
 
 
 def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dpi: float = 110) -> None:
@@ -101,16 +105,25 @@ def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dp
 
 
 def _play(
-    figure: Figure, axes: Sequence[Axes], states: Sequence[States], trace: Callable[[int], None] = lambda frame: None
+    figure: Figure,
+    axes: Sequence[Axes],
+    states: Sequence[States],
+    acting: Sequence[Acting],
+    trace: Callable[[int], None] = lambda frame: None,
 ) -> FuncAnimation:
-    """Animate each of `states` on its axes; `trace(frame)` draws whatever else changes from frame to frame."""
+    """Animate each of `states`, and what acts on it, on its axes.
+
+    `trace(frame)` draws whatever else changes from frame to frame.
+    """
     beams = [_Beam(ax, each.scene) for ax, each in zip(axes, states, strict=True)]
-    pushing = [each.measure(_pushing) for each in states]
-    _legend(figure, [each.scene for each in states], pushing)
+    around = [draw_acting(ax, each) for ax, each in zip(axes, acting, strict=True)]
+    doing = [each.measure(_doing) for each in states]
+    _legend(figure, acting, doing)
 
     def draw(frame: int) -> None:
-        for ax, artists, each, push in zip(axes, beams, states, pushing, strict=True):
-            artists.move(each.x[frame], push[frame])
+        for ax, artists, outer, each, does in zip(axes, beams, around, states, doing, strict=True):
+            artists.move(each.x[frame], does[frame])
+            outer(frame)
             ax.set_title("\n".join(filter(None, [each.title, _ratios(each.commands[frame])])), fontsize="medium")
         trace(frame)
 

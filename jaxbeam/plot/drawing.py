@@ -15,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from jaxbeam.core.tree import Numbers
+from jaxbeam.plot.acting import Acting
 from jaxbeam.plot.lines import (
     arms,
     drawn_terms,
@@ -26,6 +27,7 @@ from jaxbeam.plot.lines import (
     rings,
     term_lines,
 )
+from jaxbeam.plot.loads import force_handle
 from jaxbeam.scene.scene import Scene, placed
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
@@ -38,6 +40,13 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
 # Dashes of a tendon that pushes, and of the unstable part of a branch.
 PUSHING = (0, (2.2, 1.3))
+# What a tendon does beside pulling, numbered as `_doing` has it, and how it looks then.
+DOING = ("", "pushing", "slack")
+LOOKS: tuple[dict[str, Any], ...] = (
+    {"linestyle": "-", "linewidth": 2.0, "alpha": None},
+    {"linestyle": PUSHING, "linewidth": 2.0, "alpha": None},
+    {"linestyle": "-", "linewidth": 0.8, "alpha": 0.6},
+)
 UNSTABLE = (0, (3.0, 1.8))
 # Width of a figure in inches: the text width of a paper.
 PAPER = 7.2
@@ -91,29 +100,32 @@ class _Beam:
             self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
         (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
 
-    def move(self, x: np.ndarray, pushing: np.ndarray) -> None:
-        """Draw the beam at `x` `(n, 2)`; tendons that push, `pushing` `(m,)`, are dashed."""
+    def move(self, x: np.ndarray, doing: np.ndarray) -> None:
+        """Draw the beam at `x` `(n, 2)`; tendons that push or are slack, by `doing` `(m,)`, look different."""
         around: Any = rings(x, self.elements)  # matplotlib is far quicker with an array than with the list it asks for
         self.body.set_verts(around, closed=not self.rod)
         self.outline.set_segments(list(edge_curves(x, self.edges)))
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
         paths = term_lines(self.scene, x)
         self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
-        for name, line, path, push in zip(self.names, self.tendons, paths, pushing, strict=True):
+        for name, line, path, what in zip(self.names, self.tendons, paths, doing, strict=True):
             line.set_data(*path.T)
-            line.set(linestyle=PUSHING if push else "-", label=name + " (pushing)" * bool(push))
+            line.set(label=name + f" ({DOING[what]})" * bool(what), **LOOKS[what])
 
 
-def _pushing(scene: Scene, x: jax.Array) -> jax.Array:
-    """Whether each of the drawn lines, such as tendons, is in compression, `(m,)`.
+def _doing(scene: Scene, x: jax.Array) -> jax.Array:
+    """What each of the drawn lines, such as tendons, does, `(m,)`: 0 if it pulls, 1 if it pushes, 2 if it is slack.
 
-    Positions are scaled by 1 + 1e-5, so that round-off does not make a line at its commanded length look compressed.
+    Positions are scaled by 1 + 1e-5, so that round-off does not make a line at its commanded length look compressed. A
+    line is slack if it has no tension at all when it is a little shorter than it is: a two-way tendon would push.
     """
-    x, found = x.at[:, :2].multiply(1 + 1e-5), []
+    found = []
     for term, lines in drawn_terms(scene):
-        tension = term.kind.measured(x[term.nodes], term.params).get("tension")
-        found.append(jnp.zeros(len(lines), bool) if tension is None else tension < 0)
-    return jnp.concatenate([*found, jnp.zeros(0, bool)])
+        scaled = (x.at[:, :2].multiply(by)[term.nodes] for by in (1 + 1e-5, 1 - 1e-5))
+        tensions = [term.kind.measured(here, term.params).get("tension") for here in scaled]
+        longer, shorter = (jnp.ones(len(lines)) if each is None else each for each in tensions)
+        found.append(jnp.where(longer < 0, 1, jnp.where(shorter == 0, 2, 0)))
+    return jnp.concatenate([*found, jnp.zeros(0, int)])
 
 
 def _positions(scene: Scene, x: Numbers) -> np.ndarray:
@@ -189,18 +201,20 @@ def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
         ax.set_aspect("equal")
 
 
-def _legend(figure: Figure, scenes: Sequence[Scene], pushing: Sequence[np.ndarray]) -> None:
+def _legend(figure: Figure, acting: Sequence[Acting], doing: Sequence[np.ndarray]) -> None:
     """One legend below all panels.
 
     Args:
         figure: of the panels.
-        scenes: of the beams.
-        pushing: for each beam, `(..., m)` booleans from `_pushing`, of one state or of several.
+        acting: what acts on each beam.
+        doing: for each beam, `(..., m)` numbers from `_doing`, of one state or of several.
     """
-    names = max((line_names(scene) for scene in scenes), key=len)
+    names = max((line_names(each.scene) for each in acting), key=len)
     handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=name) for k, name in enumerate(names)]
-    if any(each.any() for each in pushing):
-        handles.append(Line2D([], [], color="0.3", lw=2, linestyle=PUSHING, label="pushing"))
+    for what in (1, 2):
+        if any((each == what).any() for each in doing):
+            handles.append(Line2D([], [], color="0.3", label=DOING[what], **LOOKS[what]))
+    handles += force_handle(acting)
     handles.append(Line2D([], [], color=GHOST, linestyle="dotted", label="at rest"))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False)
 

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from jaxbeam.core.tree import Numbers
+from jaxbeam.plot.acting import Acting
 from jaxbeam.plot.drawing import (
     MARKERS,
     OUTLINE,
@@ -26,16 +27,17 @@ from jaxbeam.plot.drawing import (
     UNSTABLE,
     Limits,
     _Beam,
+    _doing,
     _fit,
     _legend,
     _panels,
     _positions,
     _prepare,
-    _pushing,
     _ratios,
     limits,
 )
 from jaxbeam.plot.lines import elements_of, extremes
+from jaxbeam.plot.loads import draw_acting
 from jaxbeam.plot.states import States
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene
@@ -45,24 +47,26 @@ from jaxbeam.study.branch import Branch
 
 
 def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | None = None) -> Axes:
-    """The beam with its mesh, tendons, guides and anchors, clamp, and its outline at rest.
+    """The beam with its mesh, tendons, guides and anchors, clamp, what acts on it, and its outline at rest.
 
     Args:
-        scene: under the commands of this state, which decide which tendons push.
+        scene: under the commands of this state, which decide which tendons push and where obstacles are.
         x: `(n, 2)` node positions.
         ax: where to draw (`ax.legend()` names what is there); by default a new figure with a legend.
-        bounds: axis limits, by default those that hold the beam here and at rest.
+        bounds: axis limits, by default those that hold the beam here and at rest, and what acts on it.
 
     Raises:
         ValueError: if `x` has another shape or is not finite.
     """
     positions = _positions(scene, x)
-    bounds = bounds or limits(*extremes(scene, positions[None]))
+    acting = Acting(scene, positions[None])
+    bounds = bounds or limits(*extremes(scene, positions[None]), *acting.extremes())
     figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
-    pushing = np.asarray(_pushing(scene, jnp.asarray(positions)))
-    _Beam(axes[0], scene).move(positions, pushing)
+    doing = np.asarray(_doing(scene, jnp.asarray(positions)))
+    _Beam(axes[0], scene).move(positions, doing)
+    draw_acting(axes[0], acting)(0)
     if figure:
-        _legend(figure, [scene], [pushing])
+        _legend(figure, [acting], [doing])
         _fit(figure, axes)
     return axes[0]
 
@@ -83,7 +87,7 @@ def field(
     Sequential colours (viridis), or diverging ones (red above, blue below) about `centre`.
 
     Args:
-        scene: what the values were measured on.
+        scene: what the values were measured on, under the commands of this state.
         x: `(n, 2)` node positions.
         values: `(t,)`, one for each element of the solids, such as `jacobians(scene, x)`.
         label: text of the colour bar: quantity and unit.
@@ -110,10 +114,12 @@ def field(
         reach = max(abs(low - centre), abs(high - centre))
         low, high = centre - reach, centre + reach
     extend = ("neither", "min", "max", "both")[int(numbers.min() < low) + 2 * int(numbers.max() > high)]
-    bounds = bounds or limits(*extremes(scene, positions[None]))
+    acting = Acting(scene, positions[None])
+    bounds = bounds or limits(*extremes(scene, positions[None]), *acting.extremes())
     figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
     artists = _Beam(axes[0], scene, tendon_colours=(OUTLINE,))
-    artists.move(positions, np.zeros(len(artists.tendons), bool))
+    artists.move(positions, np.zeros(len(artists.tendons), int))
+    draw_acting(axes[0], acting)(0)
     for line in artists.tendons:
         line.set(linewidth=1.2, markersize=3, path_effects=[withStroke(linewidth=2.8, foreground="white")])
     artists.body.set(array=numbers, cmap="viridis" if centre is None else "RdBu_r", norm=Normalize(low, high))
@@ -241,19 +247,22 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
     if columns < 1:
         raise ValueError(f"columns: expected at least 1, got {columns}")
     columns = min(columns, len(states))
-    hold = lambda x: limits(*extremes(states.scene, x))
-    across = hold(states.x)[0]
-    rows = [(across, hold(states.x[k : k + columns])[1]) for k in range(0, len(states), columns)]
+    acting = Acting(states.scene, states.x, states.commands)
+    hold = lambda shown: limits(*extremes(states.scene, states.x[shown]), *acting.extremes(shown))
+    every = range(len(states))
+    across = hold(every)[0]
+    rows = [(across, hold(every[k : k + columns])[1]) for k in every[::columns]]
     figure, axes = _panels(columns, rows)
     for k in range(len(states), len(axes)):
         axes[k].remove()
         axes[k - columns].tick_params(labelbottom=True)
         axes[k - columns].set_xlabel("x (length units)")
-    pushing = states.measure(_pushing)
-    for ax, title, x, push in zip(axes, titles, states.x, pushing, strict=False):
+    doing = states.measure(_doing)
+    for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
         ax.set_title(title, fontsize="medium")
-        _Beam(ax, states.scene).move(x, push)
-    _legend(figure, [states.scene], [pushing])
+        _Beam(ax, states.scene).move(states.x[k], doing[k])
+        draw_acting(ax, acting)(k)
+    _legend(figure, [acting], [doing])
     _fit(figure, axes[::columns])
     return figure
 
