@@ -95,6 +95,8 @@ class _Beam:
         for collection in (ghost, self.body, self.outline, self.held):
             ax.add_collection(collection, autolim=False)
         _draw_clamp(ax, scene, self.edges)
+        self.supported = np.flatnonzero((scene.held & ~scene.fixed).any(axis=1))
+        (self.supports,) = ax.plot([], [], "s", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=7)
         self.tendons: list[Line2D] = []
         for colour in colours:
             self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
@@ -106,6 +108,7 @@ class _Beam:
         self.body.set_verts(around, closed=not self.rod)
         self.outline.set_segments(list(edge_curves(x, self.edges)))
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
+        self.supports.set_data(*x[self.supported, :2].T)
         paths = term_lines(self.scene, x)
         self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
         for name, line, path, what in zip(self.names, self.tendons, paths, doing, strict=True):
