@@ -110,7 +110,9 @@ class _Beam:
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
         self.supports.set_data(*x[self.supported, :2].T)
         paths = term_lines(self.scene, x)
-        self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *(path[1:-1] for path in paths)]).T)
+        # A line with fewer points than others repeats its end, which is no guide.
+        guides = [path[1:-1][(path[1:-1] != path[-1]).any(axis=1)] for path in paths]
+        self.guides.set_data(*np.concatenate([np.zeros((0, 2)), *guides]).T)
         for name, line, path, what in zip(self.names, self.tendons, paths, doing, strict=True):
             line.set_data(*path.T)
             line.set(label=name + f" ({DOING[what]})" * bool(what), **LOOKS[what])

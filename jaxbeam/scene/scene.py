@@ -135,6 +135,7 @@ def _check_dtype(number: int, term: Term, dtype: Any) -> None:
             )
 
 
+@usual_rules
 def _check_energy(number: int, term: Term, nodes: jax.Array) -> None:
     """Refuse an energy that returns no scalar."""
     leaves, structure = jax.tree.flatten(term.params)

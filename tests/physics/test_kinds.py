@@ -171,3 +171,11 @@ def test_slack_and_taut():
     assert jb.tendon_slack(scene, x).tolist() == [False, True]
     two_way, _ = made("tendon")
     assert jb.tendon_slack(jb.command(two_way, [0.8, 1.3]), x).tolist() == [False, False]
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_a_scene_is_built_where_rank_promotion_is_forbidden(kind):
+    scene, _ = made(kind)
+    jb.scene.scene._traced_once.cache_clear()
+    with jax.numpy_rank_promotion("raise"):
+        jb.Scene(scene.mesh, scene.terms, scene.fixed, scene.tip)
