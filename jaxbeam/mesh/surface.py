@@ -25,7 +25,7 @@ import numpy as np
 from jaxbeam.core.tree import Key, is_concrete, key_of, read_only
 from jaxbeam.mesh.element import edge_functions, edge_rule
 from jaxbeam.mesh.elements import element_of
-from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.mesh import Mesh, check_triangles
 
 # Gauss's rule of three points on (0, 1): exact for a shape function times the weights, on a straight edge.
 _POINTS, _SHARES = edge_rule(3)
@@ -140,8 +140,9 @@ def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
     """The edges `(m, k)` of the surface of which both corners are among `nodes`.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if there is none, or `mesh` is the line of a rod.
     """
+    check_triangles(mesh)
     edges = surface(mesh)
     chosen = edges[np.isin(edges[:, :2], nodes).all(axis=1)]
     if not len(chosen):

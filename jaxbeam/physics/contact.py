@@ -30,7 +30,7 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, spread, static_field
 from jaxbeam.mesh.element import edge_functions, edge_rule, edge_slopes
-from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
 from jaxbeam.mesh.surface import edges_between, finer_edges
 from jaxbeam.physics.energy import Energy, Term, check_nodes
@@ -242,10 +242,9 @@ def contact(
 
     Raises:
         ValueError: if a node is out of range, no edge of the surface lies between the nodes, an argument has another
-            shape or is out of its range, the body lies inside the obstacle at rest, or the obstacle is thinner than an
+            shape or is out of its range, the body and the obstacle overlap at rest, or the obstacle is thinner than an
             edge is long.
     """
-    check_triangles(mesh)
     edges = edges_between(mesh, check_nodes("nodes", mesh, nodes, ndim=1))
     checks.instance("obstacle", obstacle, Obstacle, "make one with half_plane, disk or box")
     numbers = [checks.number("stiffness", stiffness, checks.POSITIVE)]
@@ -269,18 +268,25 @@ def contact(
 
 
 @partial(jax.jit, static_argnums=0)
+def _distances(energy: ContactEnergy, points: jax.Array, params: ContactParams) -> jax.Array:
+    """Distances `(p,)` of `points` `(p, 2)` from the obstacle."""
+    return energy.obstacle(points, params)
+
+
+@partial(jax.jit, static_argnums=0)
 def _gaps(energy: ContactEnergy, x: jax.Array, params: ContactParams) -> jax.Array:
     """Distances `(m, q)` of edges at `x` `(m, k, 2)` from the obstacle."""
     return jax.vmap(energy.gaps)(x, params)
 
 
 def _check_outside(mesh: Mesh, term: Term) -> None:
-    """Refuse an obstacle that holds part of the surface inside at rest, or is thinner than an edge is long."""
+    """Refuse an obstacle that at rest holds part of the surface inside, or lies in the body, or is too thin."""
     if not is_concrete(mesh.nodes, *jax.tree.leaves(term.params)):
         return
-    gaps = np.asarray(_gaps(term.energy, np.asarray(mesh.nodes)[term.nodes], term.params))
+    rest = np.asarray(mesh.nodes)
+    gaps = np.asarray(_gaps(term.energy, rest[term.nodes], term.params))
     # A surface that lies on the obstacle touches it up to round-off.
-    size = np.ptp(np.asarray(mesh.nodes), axis=0).max()
+    size = np.ptp(rest, axis=0).max()
     if gaps.min() < -1e-6 * size:
         k = int(np.argmin(gaps.min(axis=1)))
         raise ValueError(
@@ -288,7 +294,18 @@ def _check_outside(mesh: Mesh, term: Term) -> None:
             f"it at rest; place it outside, and move it in by its command"
         )
     stride, longest = term.params.stride, float(np.sum(np.asarray(term.params.lengths), axis=1).max())
-    if stride is not None and 4 * float(stride[0]) < (1 - 1e-6) * longest:
+    if stride is None:
+        return
+    # What has no thickness, such as a half-plane, may cut through parts of the body that it is not to touch.
+    points = np.concatenate([rest, rest[mesh.elements].mean(axis=1)])
+    within = -np.asarray(_distances(term.energy, points, term.params))
+    if within.max() > 1e-6 * size:
+        x, y = points[int(np.argmax(within))]
+        raise ValueError(
+            f"obstacle: at rest it lies in the body, at ({x:.4g}, {y:.4g}); place it outside, and move it in by its "
+            f"command"
+        )
+    if 4 * float(stride[0]) < (1 - 1e-6) * longest:
         raise ValueError(
             f"obstacle: its thickness is {4 * float(stride[0]):.3g}, less than the longest edge that may touch it, "
             f"{longest:.3g}, between whose points it could pass; refine the mesh there"

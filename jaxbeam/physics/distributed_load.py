@@ -126,7 +126,6 @@ def traction(mesh: Mesh, nodes: Numbers, force: Numbers) -> Term:
         ValueError: if a node is out of range, no edge of the surface lies between the nodes, `force` has another shape
             or is not finite, or the mesh is the line of a rod.
     """
-    check_triangles(mesh)
     edges = edges_between(mesh, check_nodes("nodes", mesh, nodes, ndim=1))
     return _on_edges(mesh, edges, checks.numbers("force", force, shapes=((2,),)))
 

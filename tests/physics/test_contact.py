@@ -216,6 +216,9 @@ def test_a_users_own_shape_and_an_error_bar():
 
 
 def test_bad_obstacles_are_refused():
+    square = jb.rectangle(4.0, 4.0, 9, 9)
+    with pytest.raises(ValueError, match=r"obstacle: at rest it lies in the body, at \(0, 0\)"):
+        jb.contact(square, np.arange(81), jb.disk([0.0, 0.0], 0.6), 1.0, 0.1)
     with pytest.raises(ValueError, match="direction: expected a vector of positive length"):
         jb.contact(jb.rectangle(1.0, 1.0, 3, 3), [0, 3, 6], jb.disk([0.0, -2.0], 0.5), 1.0, 0.1, direction=[0.0, 0.0])
     mesh = jb.rectangle(3.5, 0.8, 9, 3)
