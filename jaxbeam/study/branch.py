@@ -121,8 +121,8 @@ def trace_branch(
             the two differ change in proportion, from `scene` at `s = 0` to it at `s = 1`.
         x0: `(n, 2)` positions of the start: an equilibrium, or near one; by default the rest positions.
         parameter: `s` of the start.
-        through: a bifurcation at which to start, in place of `x0` and `parameter`. Its branch ends there: to follow
-            both halves, call it with both directions.
+        through: a bifurcation at which to start, in place of `x0` and `parameter`, of a branch traced with the same
+            `scene` and `ratios`. To follow both halves of the branch that crosses there, call it with both directions.
         direction: `1` to start towards larger `s`, `-1` towards smaller. From a bifurcation, `1` starts along its
             `shape`, and `-1` against it.
         interval: range of `s`; the branch is followed until `s` leaves it.
@@ -152,7 +152,7 @@ def trace_branch(
         x = _first_state(path, parameter, x0)
         points = [path.advance(_start(x, parameter, np.zeros_like(x), direction), 0.0)]
     else:
-        points = _beside(path, through, direction, step)
+        points = _beside(path, through, direction, step)[:max_points]
     return _branch(path, *_walk(path, points, interval, step, max_points, progress))
 
 
