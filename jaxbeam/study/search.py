@@ -29,6 +29,8 @@ from jaxbeam.study.quadratic import Program, best_step, softness
 RADIUS = 0.3
 # Largest change that counts as converged. Steps converge quadratically, so the answer is within about its square.
 REST = 1e-6
+# The most trials with a slack command shortened, until one is nearer to the target.
+TIGHTENED = 8
 
 
 class Task(NamedTuple):
@@ -122,6 +124,7 @@ class SearchState:
     scale: largest squared norm of a slope so far.
     probing: whether the step looks for an effect of commands that have none.
     resting: whether the search has converged.
+    rested: distance from the target where it last converged short of it, and slack commands were tried.
     solves: number of equilibria solved.
     tried: commands, distance and status of each trial.
     status: how the search ends.
@@ -137,6 +140,7 @@ class SearchState:
     scale: float = 0.0
     probing: bool = False
     resting: bool = False
+    rested: float = np.inf
     solves: int = 0
     tried: list[tuple[np.ndarray, float, int]] = dataclasses.field(default_factory=list)
     status: DesignStatus = DesignStatus.NOT_CONVERGED
@@ -146,7 +150,8 @@ def search(task: Task, start: np.ndarray | Trial) -> SearchState:
     """Search by sequential quadratic programming.
 
     A command without an effect, to first and second order, may have one elsewhere: its tendon may be slack here, or the
-    measure flat. If the search would end short of the target, such commands are shortened until an effect is seen.
+    measure flat. If the search would end short of the target, such commands are shortened until an effect is seen. One
+    that pulled before may have gone slack on the way: each is tried once more (see `_tightened`).
 
     Args:
         task: what to search for.
@@ -162,6 +167,9 @@ def search(task: Task, start: np.ndarray | Trial) -> SearchState:
             break
         _plan(task, state)
         small = not state.radius > 1e-3 * REST
+        if state.resting and (tightened := _tightened(task, state)) is not None:
+            trial, state.resting, state.radius, state.probing = tightened, False, RADIUS, True
+            continue
         if state.resting or small or state.solves >= task.max_solves or not np.isfinite(state.step).all():
             break
         trial = _tried(task, state, np.clip(state.here.theta + state.step, task.low, task.high), state.here)
@@ -242,6 +250,49 @@ def _plan(task: Task, state: SearchState) -> None:
     state.probing = (rest or state.probing) and not near and not state.seen.all()
     state.step = np.where(state.seen, 0, -np.minimum(room, radius)) if state.probing else step
     state.resting = rest and not state.probing
+
+
+def _tightened(task: Task, state: SearchState) -> Trial | None:
+    """A trial nearer to the target than where the search rests short of it, with a slack command shortened; or None."""
+    here = state.here
+    if here is None or here.deviation <= task.tolerance or not here.distance < 0.999 * state.rested:
+        return None
+    state.rested = here.distance
+    for k in np.flatnonzero(~moved_by(task, here) & (here.theta - task.low > REST)):
+        if (nearer := _tighten(task, state, here, int(k))) is not None:
+            return nearer
+    return None
+
+
+def _tighten(task: Task, state: SearchState, here: Trial, k: int) -> Trial | None:
+    """A trial nearer to the target than `here`, with the slack command `k` shortened; None if that brings it no nearer.
+
+    Beyond the command at which it begins to act, the measure is nearly linear in it. So a trial there, at which the
+    measure has changed by `change` and has the slope `s`, tells both where it begins to act, `change . s / s . s`
+    before that trial, and how far beyond it is best shortened, `-miss . s / s . s`.
+    """
+    slack, acting, wanted = here.theta[k], None, task.low[k]
+    for _ in range(TIGHTENED):
+        if state.solves >= task.max_solves:
+            return None
+        trial = _tried(task, state, np.where(np.arange(here.theta.size) == k, wanted, here.theta), here)
+        if trial.good and trial.distance < here.distance:
+            return trial
+        if not trial.good:
+            acting = wanted
+        elif not moved_by(task, trial)[k]:
+            if acting is None:
+                return None
+            slack = wanted
+        else:
+            acting, slope = wanted, trial.slope[:, k]
+            begins = acting - (trial.value - here.value) @ slope / (slope @ slope)
+            wanted = begins - here.miss @ slope / (slope @ slope)
+            if wanted >= begins:
+                return None
+        if not acting < wanted < slack:
+            wanted = 0.5 * (acting + slack)
+    return None
 
 
 def moved_by(task: Task, at: Trial) -> np.ndarray:
