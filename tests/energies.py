@@ -2,13 +2,13 @@
 
 In the most direct form: in the deformation gradient `F` and not in `H = F - I`, shape functions differentiated by JAX,
 always in float64. Positions are taken from the first node, so that it does not matter where the body lies. Forces and
-Hessians follow by automatic differentiation.
+Hessians follow by automatic differentiation. What acts on the body is in `tests/actions.py` and `tests/obstacles.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -17,33 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from tests.geometry import SIDES, determinants, patch, volumes
+from tests.actions import Action, DeadLoads, Stencils, Support, Tendons
+from tests.geometry import SIDES, determinants, volumes
+from tests.obstacles import Contact
 
-POWERS = {"constant": 0.0, "inverse": 1.0, "inverse-square": 2.0}
 EPS = float(np.finfo(np.float64).eps)
 
 
 @dataclasses.dataclass(frozen=True)
-class Tendons:
-    """A group of `m` tendons through `p` points each, of one stiffness law, `k = modulus / wanted length ** power`.
-
-    lines: `(m, p)` node numbers. modulus: `(m,)` or scalar. widths: `(m, p)` or scalar, of the patches of surface that
-    points stand for. aside: `(m, p)` or scalar, on a rod the distance of points from the axis, to its left.
-    """
-
-    lines: np.ndarray
-    modulus: Any
-    law: str
-    widths: Any = 0.0
-    aside: Any = 0.0
-
-
-@dataclasses.dataclass(frozen=True)
 class Problem:
-    """A scene as raw arrays: `n` nodes, `t` elements, groups of tendons.
+    """A scene as raw arrays: `n` nodes, `t` elements, groups of tendons, and what else acts on it.
 
     nodes: `(n, 2)`, of a rod `(n, 3)`. elements: `(t, 3)` or `(t, 6)`, of a rod `(t, 2)`. fixed: like `nodes`.
     young, poisson: `(t,)` or scalars. corrected: whether `lam` is raised by `mu`. load: dead forces like `nodes`.
+    actions: all other kinds, after the tendons and the load.
     height, radian: of the section of a rod, and the length that stands for a radian in the third column.
     """
 
@@ -58,6 +45,7 @@ class Problem:
     load: np.ndarray | None = None
     height: float = 0.0
     radian: float = 1.0
+    actions: tuple[Action, ...] = ()
 
     @property
     def is_rod(self) -> bool:
@@ -72,11 +60,6 @@ class Problem:
     def rest(self) -> np.ndarray:
         """Rest positions in float64, from the first node."""
         return self.relative(self.nodes)
-
-    @cached_property
-    def centred(self) -> Problem:
-        """The same with the first node at the origin, in float64."""
-        return dataclasses.replace(self, nodes=self.rest)
 
     def relative(self, x: np.ndarray) -> np.ndarray:
         """Positions from the first node at rest. The third column of a rod is an angle, and stays."""
@@ -93,44 +76,60 @@ class Problem:
         return mu, 2 * mu * poisson / (1 - 2 * poisson) + (mu if self.corrected else 0)
 
     @cached_property
-    def bodies(self) -> list[Stencils]:
-        """What does not depend on the command."""
+    def body(self) -> Stencils:
+        """The elements."""
         elements, (mu, lam) = np.asarray(self.elements), self.lame
         corners = self.rest[elements]
         if self.is_rod:
             section = [np.full(len(elements), float(value)) for value in (self.radian, self.height)]
-            found = [Stencils(rod_of(self.material), elements, (corners, *section, mu, lam))]
-        else:
-            found = [Stencils(element_of(self.material), elements, (corners, mu, lam))]
-        if self.load is not None:
-            loaded = np.flatnonzero(np.any(self.load, axis=1))
-            force = np.asarray(self.load, np.float64)[loaded]
-            found.append(Stencils(load_energy, loaded[:, None], (self.rest[loaded], force)))
-        return found
+            return Stencils(rod_of(self.material), elements, (corners, *section, mu, lam))
+        return Stencils(element_of(self.material), elements, (corners, mu, lam))
 
     @cached_property
-    def threads(self) -> list[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
-        """Of each group the nodes `(m, k)`, and weights, `aside`, `radian`, modulus, natural length and power."""
-        return [_attached(self, group) for group in self.tendons]
+    def acting(self) -> list[tuple[Action, Any]]:
+        """All that acts on the body, in the order of commands, and what each is made of."""
+        load = () if self.load is None else (DeadLoads(self.load),)
+        return [(action, action.attached(self)) for action in (*self.tendons, *load, *self.actions)]
+
+    @property
+    def has_loads(self) -> bool:
+        return any(action.rest is None for action, _ in self.acting)
+
+    @cached_property
+    def rest_commands(self) -> np.ndarray:
+        """The commands `(m,)` at which what is commanded does nothing."""
+        return np.concatenate([np.zeros(0), *(np.full(a.count, a.rest) for a, _ in self.acting if a.count)])
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """Coordinates `(n, d)` that are fixed or that a support moves."""
+        return np.any([self.fixed, *(a.held(self) for a in self.actions if isinstance(a, Support))], axis=0)
+
+    def commanded(self, ratios: np.ndarray) -> Iterator[tuple[Action, Any, np.ndarray]]:
+        """Each that acts, what it is made of, and those of the commands `(m,)` that are its own."""
+        start, ratios = 0, np.asarray(ratios, np.float64)
+        for action, attached in self.acting:
+            yield action, attached, ratios[start : start + action.count]
+            start += action.count
+
+    def displacements(self, ratios: np.ndarray) -> np.ndarray:
+        """Where supports move coordinates `(n, d)`; zero for the others."""
+        moves = (c[0] * a.motions(self) for a, _, c in self.commanded(ratios) if isinstance(a, Support))
+        return sum(moves, np.zeros(np.shape(self.nodes)))
 
     def stencils(self, ratios: np.ndarray, loaded: float = 1.0) -> list[Stencils]:
         """All that stores energy under the commands `(m,)`, with a share of the dead loads."""
-        found, start = list(self.bodies), 0
-        if self.load is not None:
-            found[-1] = found[-1]._replace(params=(found[-1].params[0], loaded * found[-1].params[1]))
-        for nodes, params in self.threads:
-            commanded = np.asarray(ratios, np.float64)[start : start + len(nodes)]
-            found.append(Stencils(tendon_energy, nodes, (*params, commanded)))
-            start += len(nodes)
+        found = [self.body]
+        for action, attached, commands in self.commanded(ratios):
+            if attached is not None:
+                nodes, params = attached
+                last = np.broadcast_to(commands if action.count else loaded, len(nodes)).astype(np.float64)
+                found.append(Stencils(action.energy, nodes, (*params, last), action.force))
         return found
 
-
-class Stencils(NamedTuple):
-    """Stencils of one energy `(x, *params) -> scalar`: their nodes `(m, k)`, and parameters with leading axis `m`."""
-
-    energy: Callable[..., jax.Array]
-    nodes: np.ndarray
-    params: tuple[np.ndarray, ...]
+    def contacts(self, ratios: np.ndarray) -> list[tuple[Contact, float]]:
+        """Obstacles, and how far each is moved."""
+        return [(a, float(c[0])) for a, _, c in self.commanded(ratios) if isinstance(a, Contact)]
 
 
 # ------------------------------------------------------------------------------------------------ solids
@@ -232,72 +231,20 @@ def _fibres(x: jax.Array, rest: jax.Array, radian: jax.Array, height: jax.Array)
     return jax.vmap(one)(x, rest, radian, height)
 
 
-# ----------------------------------------------------------------------------------- tendons and loads
-
-
-def _attached(problem: Problem, group: Tendons) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Nodes `(m, k)` and parameters of a group but its command."""
-    lines = np.asarray(group.lines)
-    widths, aside = (np.broadcast_to(np.asarray(v, float), lines.shape) for v in (group.widths, group.aside))
-    if widths.any():
-        ends = zip(lines.ravel(), widths.ravel(), strict=True)
-        dense = np.stack([patch(problem.rest, problem.elements, *pair) for pair in ends])
-        dense = dense.reshape(*lines.shape, -1)
-        nodes = np.argsort(-np.any(dense, axis=1).astype(int), axis=1, kind="stable")
-        nodes = nodes[:, : int(np.any(dense, axis=1).sum(axis=1).max())]
-        weights = np.take_along_axis(dense, nodes[:, None], axis=2)
-    else:
-        nodes, weights = lines, np.tile(np.eye(lines.shape[1]), (len(lines), 1, 1))
-    radian = np.full(len(lines), float(problem.radian))
-    natural = np.asarray(_lengths(problem.rest[nodes], weights, aside, radian))
-    modulus = np.broadcast_to(np.asarray(group.modulus, np.float64), natural.shape)
-    return nodes, (weights, aside, radian, modulus, natural, np.full(len(lines), POWERS[group.law]))
-
-
-@jax.jit
-@jax.vmap
-def _lengths(x: jax.Array, weights: jax.Array, aside: jax.Array, radian: jax.Array) -> jax.Array:
-    return jnp.linalg.norm(jnp.diff(_points(x, weights, aside, radian), axis=0), axis=1).sum()
-
-
-def _points(x: jax.Array, weights: jax.Array, aside: jax.Array, radian: jax.Array) -> jax.Array:
-    """Points `(p, 2)` of a tendon: means of its nodes, and on a rod beside the axis."""
-    mean = weights @ x
-    if x.shape[1] == 2:
-        return mean
-    angle = mean[:, 2] / radian
-    return mean[:, :2] + aside[:, None] * jnp.stack([-jnp.sin(angle), jnp.cos(angle)], axis=1)
-
-
-def tendon_energy(
-    x: jax.Array, weights: Any, aside: Any, radian: Any, modulus: Any, natural: Any, power: Any, ratio: Any
-) -> jax.Array:
-    """`1/2 k (l - l*)^2`. A segment of no length has no direction, and none is given."""
-    edge = jnp.diff(_points(x, weights, aside, radian), axis=0)
-    meet = jnp.all(edge == 0, axis=1)
-    length = jnp.sum(jnp.where(meet, 0, jnp.linalg.norm(jnp.where(meet[:, None], 1.0, edge), axis=1)))
-    wanted = ratio * natural
-    return modulus / wanted**power / 2 * (length - wanted) ** 2
-
-
-def load_energy(x: jax.Array, rest: jax.Array, force: jax.Array) -> jax.Array:
-    """`-f . (x - X)` of one node `(1, d)`."""
-    return -jnp.sum(force * (x[0] - rest))
-
-
 # --------------------------------------------------------------------------------------- all of it at x
 
 
-@partial(jax.jit, static_argnames="energy")
-def _derivatives(energy: Any, x: jax.Array, params: Any) -> Any:
+@partial(jax.jit, static_argnames=("energy", "force"))
+def _derivatives(energy: Any, force: Any, x: jax.Array, params: Any) -> Any:
     """Energies and gradients of stencils, and their Hessians."""
-    return jax.vmap(jax.value_and_grad(energy))(x, *params), jax.vmap(jax.hessian(energy))(x, *params)
+    force = force or jax.grad(energy)
+    return tuple(jax.vmap(each)(x, *params) for each in (energy, force, jax.jacfwd(force)))
 
 
-@jax.jit
-def _by_command(x: jax.Array, params: Any) -> jax.Array:
-    """Derivatives `(m, k, d)` of the gradients of tendons in their commands."""
-    return jax.vmap(jax.jacfwd(jax.grad(tendon_energy), argnums=7))(x, *params)
+@partial(jax.jit, static_argnames=("energy", "force"))
+def _by_command(energy: Any, force: Any, x: jax.Array, params: Any) -> jax.Array:
+    """Derivatives `(m, k, d)` of the gradients of stencils in their last parameter."""
+    return jax.vmap(jax.jacfwd(force or jax.grad(energy), argnums=len(params)))(x, *params)
 
 
 def total_energy(x: jax.Array, stencils: list[Stencils]) -> jax.Array:
@@ -310,9 +257,9 @@ class Facts(NamedTuple):
 
     energy_scale and scale_sum are sums of magnitudes, over all coordinates. scale is the largest sum of magnitudes of
     the forces at one free coordinate, stiffest the largest diagonal entry of the Hessian there, and longest_row the
-    largest Euclidean length of a row of it. gradient and hessian are over free coordinates. volumes are the least `J`
-    of each element and bounds under it, of a rod the least stretch of a fibre; heights `(t,)` those of elements at
-    rest.
+    largest Euclidean length of a row of it. gradient and hessian are over free coordinates, and rows are the rows of
+    the Hessian there, over all coordinates. volumes are the least `J` of each element and bounds under it, of a rod the
+    least stretch of a fibre; heights `(t,)` those of elements at rest.
     """
 
     energy: float
@@ -322,6 +269,7 @@ class Facts(NamedTuple):
     gradient: np.ndarray
     scale: float
     scale_sum: float
+    rows: scipy.sparse.csr_array
     hessian: np.ndarray | None
     stiffest: float
     longest_row: float
@@ -332,14 +280,20 @@ class Facts(NamedTuple):
 
 def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = True, loaded: float = 1.0) -> Facts:
     """Energy, forces and, if asked for, the dense Hessian at `x` `(n, d)`."""
-    y, free = problem.relative(x), ~np.asarray(problem.fixed).ravel()
-    d = y.shape[1]
+    return facts_from_first(problem, ratios, problem.relative(x), dense, loaded)
+
+
+def facts_from_first(
+    problem: Problem, ratios: np.ndarray, y: np.ndarray, dense: bool = True, loaded: float = 1.0
+) -> Facts:
+    """The same at positions `y` `(n, d)` from the first node."""
+    d, free = y.shape[1], ~problem.held.ravel()
     gradient, scale = np.zeros(y.shape), np.zeros(y.shape)
     sparse = scipy.sparse.csr_array((y.size, y.size))
     energy = energy_scale = 0.0
     for kind in problem.stencils(ratios, loaded):
-        found = _derivatives(kind.energy, y[kind.nodes], kind.params)
-        (energies, gradients), hessians = jax.tree.map(np.asarray, found)
+        found = _derivatives(kind.energy, kind.force, y[kind.nodes], kind.params)
+        energies, gradients, hessians = jax.tree.map(np.asarray, found)
         energy, energy_scale = energy + energies.sum(), energy_scale + np.abs(energies).sum()
         np.add.at(gradient, kind.nodes, gradients)
         np.add.at(scale, kind.nodes, np.abs(gradients))
@@ -358,6 +312,7 @@ def facts(problem: Problem, ratios: np.ndarray, x: np.ndarray, dense: bool = Tru
         gradient=gradient,
         scale=float(scale.ravel()[free].max()),
         scale_sum=float(scale.sum()),
+        rows=sparse,
         hessian=square.toarray() if dense else None,
         stiffest=float(np.abs(square.diagonal()).max()),
         longest_row=float(np.sqrt(np.asarray(sparse.multiply(sparse).sum(axis=1))).max()),
@@ -384,12 +339,22 @@ def _shape(problem: Problem, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return least, bounds, heights, 16 * EPS * float(np.sum((2 * mu + np.abs(lam)) * areas * (1 + np.abs(least))))
 
 
-def command_forces(problem: Problem, ratios: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Derivative `(f, m)` of the gradient over the `f` free coordinates in the commands."""
-    y, columns = problem.relative(x), []
-    for kind in problem.stencils(ratios)[len(problem.bodies) :]:
-        for nodes, change in zip(kind.nodes, np.asarray(_by_command(y[kind.nodes], kind.params)), strict=True):
-            column = np.zeros(y.shape)
-            np.add.at(column, nodes, change)
-            columns.append(column.ravel())
-    return np.stack(columns, axis=1)[~np.asarray(problem.fixed).ravel()]
+def command_forces(problem: Problem, ratios: np.ndarray, x: np.ndarray, rows: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives in the commands: `(f, m)` of the gradient over the `f` free coordinates, and `(n, d, m)` of the held
+    coordinates. `rows` are those of `Facts`."""
+    y, free = problem.relative(x), ~problem.held.ravel()
+    columns, moves = [np.zeros((int(free.sum()), 0))], [np.zeros((*y.shape, 0))]
+    for action, attached, commands in problem.commanded(ratios):
+        column, moved = np.zeros((2, *y.shape, action.count))
+        if isinstance(action, Support):
+            moved[..., 0] = action.motions(problem)
+            columns.append(rows @ moved.reshape(-1, 1))
+        elif action.count:
+            nodes, params = attached
+            params = (*params, np.broadcast_to(commands, len(nodes)))
+            change = np.asarray(_by_command(action.energy, action.force, y[nodes], params))
+            own = np.arange(len(nodes)) if action.count == len(nodes) else np.zeros(len(nodes), int)
+            np.add.at(column, (nodes, slice(None), own[:, None]), change)
+            columns.append(column.reshape(-1, action.count)[free])
+        moves.append(moved)
+    return np.concatenate(columns, axis=1), np.concatenate(moves, axis=2)

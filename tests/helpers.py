@@ -17,7 +17,9 @@ from jaxbeam.linear.blocks import Topology
 from jaxbeam.mesh.line import Line
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
+from tests.actions import Action, Cables, Pressure, Pulls, Support, Traction, Weight
 from tests.energies import Problem
+from tests.obstacles import Contact
 
 EPS = np.finfo(np.float64).eps
 
@@ -154,13 +156,39 @@ def scene_of(raw: Problem, tip: np.ndarray | None = None) -> jb.Scene:
     else:
         mesh = jb.Mesh(raw.nodes, raw.elements)
         body = jb.solid(mesh, material, density)
-        pulls = [jb.tendons(mesh, t.lines, t.modulus, LAWS[t.law], t.widths) for t in raw.tendons]
+        pulls = [jb.tendons(mesh, t.lines, t.modulus, LAWS[t.law], t.widths, t.shared) for t in raw.tendons]
     loaded = np.flatnonzero(np.zeros(len(raw.nodes)) if raw.load is None else raw.load.any(axis=1))
     loads = [jb.dead_load(mesh, loaded, raw.load[loaded])] if loaded.size else []
     if tip is None:
         away = np.linalg.norm((raw.rest - raw.rest[raw.fixed[:, 0]].mean(axis=0))[:, :2], axis=1)
         tip = np.flatnonzero(away > (1 - 1e-4) * away.max())
-    return jb.Scene(mesh, (body, *pulls, *loads), raw.fixed, tip)
+    return jb.Scene(mesh, (body, *pulls, *loads, *(term_of(mesh, action) for action in raw.actions)), raw.fixed, tip)
+
+
+def term_of(mesh: jb.Mesh, action: Action) -> jb.Term:
+    """The library's term of what acts on a body, under the commands at which it does nothing."""
+    match action:
+        case Cables():
+            law = LAWS[action.law]
+            return jb.cables(mesh, action.lines, action.modulus, law, action.widths, action.transition, action.shared)
+        case Pulls():
+            return jb.pulls(mesh, action.lines, width=action.widths, shared=action.shared)
+        case Weight():
+            return jb.weight(mesh, action.per_area)
+        case Traction():
+            return jb.traction(mesh, action.nodes, action.per_length)
+        case Pressure():
+            return jb.pressure(mesh, action.nodes)
+        case Contact():
+            shapes = {"half-plane": jb.half_plane, "disk": jb.disk, "box": lambda place, m: jb.box(place, m[:2], m[2])}
+            obstacle = shapes[action.shape](action.place, action.more)
+            return jb.contact(mesh, action.nodes, obstacle, action.stiffness, action.transition, action.direction)
+        case Support():
+            names = ("x", "y", "angle")[: action.motion.shape[1]]
+            columns = zip(names, action.motion.T, strict=True)
+            held = {name: column for name, column in columns if not np.isnan(column).any()}
+            return jb.support(mesh, action.nodes, **held)
+    raise TypeError(action)
 
 
 # --------------------------------------------------------------------------- references made otherwise

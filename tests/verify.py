@@ -1,7 +1,8 @@
 """Verification of answers by code that shares nothing with the solver.
 
-Energies are written anew in `tests/energies.py`, `J` and crossings of the surface in `tests/geometry.py`, always in
-float64; stability is a dense Cholesky factorisation over the free coordinates. `verify` lists what an answer claims
+Energies are written anew in `tests/energies.py`, what acts on the body in `tests/actions.py` and `tests/obstacles.py`,
+`J` and crossings of the surface in `tests/geometry.py`, always in float64; stability is a dense Cholesky factorisation
+over the free coordinates. `verify` lists what an answer claims
 and does not keep, `refuted_slope` compares a derivative.
 
 What counts as round-off, with `eps` that of the dtype of the solve and `K` the dense Hessian over free coordinates:
@@ -16,6 +17,12 @@ What counts as round-off, with `eps` that of the dtype of the solve and `K` the 
   coordinate, and, as the form in `F` cancels where that in `H` does not, `16 eps` of float64 of the moduli times areas;
 - `J`: positions are rounded by `eps max |x|`, which moves `J` by that over the height of the element;
 - slopes: `SLOPE`, and what positions are rounded by, over the size of the body, times the condition number of `K`;
+- commands: one between rest and the last of a ramp is rounded by `eps` of the larger of them, four times;
+- supports: a displacement is the product of two rounded numbers, added to a third: `2 eps` of the magnitudes;
+- distances from an obstacle: differences of numbers as large as `max |x|`, its place and its radius, so that all that
+  they decide is rounded by `eps` of the largest of these. A command may be that large too;
+- the side of an obstacle on which the surface is: cosines turn by what positions are rounded by, over the lengths of
+  edges and the radius of a disk;
 - crossings: an end of an edge that is as near to the other as `tests/geometry.py` says leaves it open.
 """
 
@@ -27,8 +34,10 @@ import numpy as np
 import scipy.linalg
 
 import jaxbeam as jb
-from tests.energies import Facts, Problem, Tendons, command_forces, density, facts, total_energy
+from tests.actions import Tendons
+from tests.energies import Facts, Problem, command_forces, density, facts, facts_from_first, total_energy
 from tests.geometry import crossings, surface
+from tests.obstacles import sides
 
 __all__ = ("Facts", "Problem", "Tendons", "Verdict", "density", "facts", "refuted_slope", "total_energy", "verify")
 
@@ -72,9 +81,15 @@ class Claim(NamedTuple):
     def reach(self) -> float:
         return float(np.abs(self.x).max())
 
+    @property
+    def span(self) -> float:
+        """The largest number in differences of positions, also those from obstacles."""
+        obstacles = [max(contact.reach, abs(moved)) for contact, moved in self.problem.contacts(self.ratios)]
+        return max(self.reach, *obstacles, 0.0)
+
     def residual(self, true: Facts) -> float:
         """The largest unbalanced force over the force scale, which leaves room for round-off."""
-        return true.unbalanced / (true.scale + FORCE * self.eps * true.longest_row * self.reach / self.rtol)
+        return true.unbalanced / (true.scale + FORCE * self.eps * true.longest_row * self.span / self.rtol)
 
 
 def verify(problem: Problem, ratios: np.ndarray, answer: Any, stability: bool = True) -> Verdict:
@@ -108,7 +123,8 @@ def _command(claim: Claim) -> list[str]:
     refuted, commanded = [], np.asarray(claim.answer.ratios)
     if jb.Status.INVALID in claim.status:
         refuted.append("INVALID, but every parameter is in its range")
-    if not np.allclose(commanded, claim.ratios, rtol=4 * claim.eps, atol=0):
+    largest = np.maximum(np.abs(claim.ratios), np.abs(claim.problem.rest_commands))
+    if not (np.abs(commanded - claim.ratios) <= 4 * claim.eps * largest).all():
         refuted.append(f"ratios {commanded} are not the command {claim.ratios}")
     return refuted
 
@@ -126,7 +142,13 @@ def _state(claim: Claim, true: Facts) -> list[str]:
     refuted, x, fixed = [], np.asarray(claim.answer.x), np.asarray(claim.problem.fixed)
     if not np.array_equal(x[fixed], np.asarray(claim.problem.nodes, x.dtype)[fixed]):
         refuted.append("a fixed coordinate has moved")
-    rounded = claim.eps * claim.reach
+    # A walk that broke off has moved its supports as far as it came.
+    moves = float(claim.answer.reached) * claim.problem.displacements(claim.ratios)
+    rest = np.asarray(claim.problem.nodes, np.float64)
+    astray = np.abs(claim.x - rest - moves) > 2 * claim.eps * (np.abs(rest) + np.abs(moves))
+    if (astray & claim.problem.held & ~fixed).any():
+        refuted.append("a support is not where its command puts it")
+    rounded = claim.eps * claim.span
     slack = 16 * (claim.eps * true.energy_scale + rounded * true.scale_sum) + true.cancelled
     slack += x.size * true.stiffest * rounded**2
     if not abs(float(claim.answer.energy) - true.energy) <= slack:
@@ -141,7 +163,7 @@ def _state(claim: Claim, true: Facts) -> list[str]:
 
 def _volume(claim: Claim, true: Facts) -> list[str]:
     """`J`, of an element with six nodes anywhere in it. A bound under it may be claimed in its place."""
-    refuted, volume, bound = [], float(true.volumes.min()), float(true.bounds.min())
+    refuted, (volume, bound) = [], _through(claim, float(true.volumes.min()), float(true.bounds.min()))
     slack = 16 * claim.eps * float(np.max(claim.reach / true.heights * np.maximum(1, np.sqrt(np.abs(true.volumes)))))
     claimed, room = float(claim.answer.smallest_jacobian), slack * max(1, abs(bound))
     if not bound - room <= claimed <= volume + room:
@@ -151,6 +173,23 @@ def _volume(claim: Claim, true: Facts) -> list[str]:
     if jb.Status.INVERTED not in claim.status and not volume > -slack:
         refuted.append(f"J = {volume:.3g}, but not INVERTED")
     return refuted
+
+
+def _through(claim: Claim, volume: float, bound: float) -> tuple[float, float]:
+    """The least `J` and the bound under it, where an obstacle in the body counts as a negative `J`.
+
+    `Solution.smallest_jacobian` may then be minus the cosine between the outward normal of the surface and the way out
+    of the obstacle, at the point of quadrature where that is largest. Points that are inside only within round-off
+    lower the bound, and no others.
+    """
+    for contact, moved in claim.problem.contacts(claim.ratios):
+        found, off = sides(claim.problem, contact, moved, claim.problem.relative(claim.x)), 4 * claim.eps * claim.span
+        turned = off * found.turns
+        sure = (found.gaps < -off) & (found.cosines > turned)
+        maybe = (found.gaps < off) & (found.cosines > -turned)
+        volume = min(volume, float(np.min(turned - found.cosines, where=sure, initial=np.inf)))
+        bound = min(bound, float(np.min(-turned - found.cosines, where=maybe, initial=np.inf)))
+    return volume, bound
 
 
 def _overlap(claim: Claim) -> list[str]:
@@ -183,8 +222,9 @@ def _balance(claim: Claim, true: Facts) -> list[str]:
 
 def _residual_partway(claim: Claim, reached: float) -> float:
     """Residual under a fraction of the command. Dead loads grow with it in a single solve, and not in a ramp."""
-    way = 1 + reached * (np.asarray(claim.ratios, np.float64) - 1)
-    shares = (1.0,) if claim.problem.load is None else (reached, 1.0)
+    rest = claim.problem.rest_commands
+    way = rest + reached * (np.asarray(claim.ratios, np.float64) - rest)
+    shares = (reached, 1.0) if claim.problem.has_loads else (1.0,)
     return min(claim.residual(facts(claim.problem, way, claim.x, dense=False, loaded=s)) for s in shares)
 
 
@@ -211,7 +251,7 @@ def _stability(claim: Claim, true: Facts) -> tuple[list[str], float, bool]:
 def _off(claim: Claim, true: Facts, factor: np.ndarray) -> float:
     """How far Newton's method moves a node from `x` until it settles, over the size of the body; infinite if it does
     not. One step tells where that is short, or many would take long."""
-    problem, free = claim.problem.centred, ~np.asarray(claim.problem.fixed)
+    problem, free = claim.problem, ~claim.problem.held
     start = claim.problem.relative(claim.x)
     x = start.copy()
     for _ in range(STEPS):
@@ -220,7 +260,7 @@ def _off(claim: Claim, true: Facts, factor: np.ndarray) -> float:
         last, off = (float(np.abs(move).max()) / problem.size for move in (step, x - start))
         if last <= SETTLED or claim.status != 0 or len(step) > MOST:
             return off
-        true = facts(problem, claim.ratios, x)
+        true = facts_from_first(problem, claim.ratios, x)
         found = definite(true.hessian, 0.0) if np.isfinite(true.hessian).all() else None
         if found is None:
             break
@@ -244,19 +284,27 @@ def definite(matrix: np.ndarray, shift: float) -> np.ndarray | None:
 def refuted_slope(problem: Problem, ratios: np.ndarray, x: np.ndarray, tip: np.ndarray, claimed: Any) -> list[str]:
     """Compare the derivative `(d, m)` of the mean position of the nodes `tip` in the commands with the exact one at
     `x`, `-K^-1 dg/dr` by the implicit function theorem. That `x` is an equilibrium is for `verify` to say."""
-    dtype, free = np.asarray(claimed).dtype, ~np.asarray(problem.fixed)
+    dtype, free = np.asarray(claimed).dtype, ~problem.held
     claimed, ratios = np.asarray(claimed, np.float64), np.asarray(ratios, np.asarray(x).dtype)
     true = facts(problem, ratios, np.asarray(x, np.float64))
     factor = definite(true.hessian, 0.0)
     if factor is None:
         return []
-    moves = np.zeros((*free.shape, len(ratios)))
-    moves[free] = -scipy.linalg.cho_solve((factor, True), command_forces(problem, ratios, x))
+    forces, moves = command_forces(problem, ratios, x, true.rows)
+    moves[free] = -scipy.linalg.cho_solve((factor, True), forces)
     slope = moves[np.asarray(tip)].mean(axis=0)[: claimed.shape[0]]
     inverse, _ = scipy.linalg.lapack.dpocon(factor, np.abs(true.hessian).sum(axis=0).max(), uplo="L")
     rounded = float(np.finfo(dtype).eps) * max(1.0, float(np.abs(np.asarray(x)).max()) / problem.size)
-    noise = rounded / inverse * np.abs(moves).max()
-    apart, largest = np.abs(claimed - slope).max(), np.abs(slope).max()
-    if not apart <= SLOPE * largest + noise:
-        return [f"slope off by {apart / largest:.3g} of itself, of which {noise / largest:.3g} may be round-off"]
-    return []
+    refuted, start = [], 0
+    # Commands of different kinds have different units.
+    for action, _, commands in problem.commanded(ratios):
+        own = slice(start, start := start + len(commands))
+        if own.start == own.stop:
+            continue
+        noise = rounded / inverse * np.abs(moves[..., own]).max()
+        apart, largest = np.abs(claimed[:, own] - slope[:, own]).max(), np.abs(slope[:, own]).max()
+        if not apart <= SLOPE * largest + noise:
+            off, may = (value / largest if largest else np.inf for value in (apart, noise))
+            kind = type(action).__name__.lower()
+            refuted.append(f"slope off by {off:.3g} of itself, of which {may:.3g} may be round-off ({kind})")
+    return refuted
