@@ -2,12 +2,12 @@
 
     python -m benchmarks.extremes [--quick] [--only TEXT] [--cases N] [--out out/extremes]
 
-Every case is one scene and one command, of `benchmarks/extreme_cases.py`, solved in one call (`jump`, by
-`equilibrium`) or by a `ramp` of 28 steps. Every answer, each step of a ramp too, is verified by `tests/verify.py`,
-which shares no code with the solver; so are the slopes of some. A case counts as *reachable* if it was solved, or if a
-ramp of 280 steps in float64 solves it; a *miss* is a reachable case that was not solved. The goals: no claim refuted,
-no NaN without a flag, no hang, 95 % of the reachable cases solved in one call and 99 % by the ramp. The exit code is 1
-if a claim was refuted.
+Every case is one scene and one command, of `benchmarks/extreme_cases.py` or `benchmarks/extreme_actions.py`, solved in
+one call (`jump`, by `equilibrium`) or by a `ramp` of 28 steps. Every answer, each step of a ramp too, is verified by
+`tests/verify.py`, which shares no code with the solver; so are the slopes of some. A case counts as *reachable* if it
+was solved, or if a ramp of 280 steps in float64 solves it; a *miss* is a reachable case that was not solved. The goals:
+no claim refuted, no NaN without a flag, no hang, 95 % of the reachable cases solved in one call and 99 % by the ramp.
+The exit code is 1 if a claim was refuted.
 
 Reachable is judged in float64 for float32 too. There a tangent stiffness whose condition number is far over 1 / eps,
 about 1e7, has no usable factor: beams of a fiftieth of their length, or beside tendons 1e4 times the reference. These
@@ -36,7 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from benchmarks.extreme_cases import Case, Group, build, cases, groups
+from benchmarks.extreme_actions import build, cases, groups
+from benchmarks.extreme_cases import Group
 from tests.verify import OVERLAPPING, Problem, refuted_slope, verify
 
 RAMP, FINE = 28, 280
@@ -72,8 +73,9 @@ def _hung(name: str) -> None:
 def judge(method: str, problem: Problem, ratios: np.ndarray, found: jb.Solution) -> dict[str, Any]:
     """Verify every answer of one case; the verdict on the last, with whatever was refuted on the way."""
     count = len(found.status)
-    way = ratios[None] if method == "jump" else np.asarray(jb.commands(ratios.astype(found.x.dtype), count))
-    unknowns = int(np.sum(~problem.fixed))
+    ramped = lambda: jb.commands(ratios.astype(found.x.dtype), count, problem.rest_commands)
+    way = ratios[None] if method == "jump" else np.asarray(ramped())
+    unknowns = int(np.sum(~problem.held))
     refuted: list[str] = []
     broken = np.flatnonzero(found.status & jb.Status.NOT_CONVERGED)
     checked = 0
@@ -109,20 +111,20 @@ def run_group(group: Group, count: int, fine: bool) -> list[dict[str, Any]]:
     records = []
     for method in ("jump", "ramp"):
         start = time.perf_counter()
-        scene = build(group, Case(), group.dtype)[0]
-        solve(method, scene, np.ones(len(jb.tendon_lengths(scene, scene.mesh.nodes))))
+        chosen = cases(group, count)
+        scene, problem, _ = build(group, chosen[0], group.dtype)
+        solve(method, scene, problem.rest_commands)
         first = time.perf_counter() - start
-        for number, case in enumerate(cases(group, count)):
+        for number, case in enumerate(chosen):
             record = {"group": str(group), "method": method, "first_call_seconds": first}
             sloped = method == "jump" and number % SLOPE_EVERY == 0
             records.append(record | run_case(group, case, method, sloped, fine))
     return records
 
 
-def run_case(group: Group, case: Case, method: str, sloped: bool, fine: bool) -> dict[str, Any]:
+def run_case(group: Group, case: Any, method: str, sloped: bool, fine: bool) -> dict[str, Any]:
     """Solve and verify one case; whether it is reachable, if `fine`."""
-    scene, problem = build(group, case, group.dtype)
-    ratios = case.ratios(sum(len(t.lines) for t in problem.tendons))
+    scene, problem, ratios = build(group, case, group.dtype)
     found, seconds = solve(method, scene, ratios, name=f"{group}, {case}")
     status = int(found.status[-1])
     record = {
@@ -143,7 +145,7 @@ def run_case(group: Group, case: Case, method: str, sloped: bool, fine: bool) ->
     }
     if seconds > SLOW:
         record["refuted"].append(f"took {seconds:.0f} s")
-    if sloped and status == 0 and np.sum(~problem.fixed) <= DENSE_EVERY:
+    if sloped and status == 0 and np.sum(~problem.held) <= DENSE_EVERY:
         record["slope"] = True
         record["refuted"] += judge_slope(scene, problem, ratios, found.x[-1])
     if status == 0:
