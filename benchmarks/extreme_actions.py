@@ -34,9 +34,10 @@ class Push:
 
     ratios: of the two cables, or of the tendons beside the kind. tension, second: of two cables. weight, traction:
     their sizes; turn: their direction in degrees. pressure. stiffness: of contact, over the reference Young's modulus
-    times length. transition: of a cable over its length, of contact over the length of the beam. pushed: how far the
-    obstacle is moved, over the height of the beam. stretch: length over that at rest. shear: how far a grip is moved
-    across, over the length of the beam. factor: of the modulus of the tendons or cables.
+    times length. transition: of a cable over its length, of contact over the length of the beam. size: of the obstacle,
+    over the reference. pushed: how far it is moved, over the height of the beam, in a direction in degrees, toward.
+    stretch: length over that at rest. shear: how far a grip is moved across, over the length of the beam. factor: of
+    the modulus of the tendons or cables.
     """
 
     top: float = 0.9
@@ -49,7 +50,9 @@ class Push:
     pressure: float = 0.01
     stiffness: float = 1e5
     transition: float = 1e-2
+    size: float = 1.0
     pushed: float = 0.3
+    toward: float = 90.0
     stretch: float = 1.1
     shear: float = 0.0
     factor: float = 1.0
@@ -79,6 +82,8 @@ CONTACT: dict[str, tuple] = {
     "stiffness": (1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9),
     "transition": TRANSITIONS,
     "top": RATIOS[3:],
+    "size": (0.4, 1.0, 3.0, 30.0),
+    "toward": (30.0, 90.0, 120.0),
 }
 KNOBS: dict[str, dict[str, tuple]] = {
     "cables": {"top": RATIOS, "bottom": RATIOS, "factor": FACTORS, "transition": TRANSITIONS},
@@ -216,7 +221,8 @@ def _actions(
         }[group.kind]
         actions = (weight, Traction(pulled, case.traction * way), Pressure(pressed))
         return (), actions, [case.pressure * case.stress * YOUNG]
-    touching, pushed = _contact(group, case, on("bottom"), shift), case.pushed * height * unit
+    if kind != "supports":
+        touching, pushed = _contact(group, case, on("bottom", "tip"), shift), case.pushed * height * unit
     if kind == "contact":
         return pair, (touching,), [*ratios, pushed]
     nodes, stretch, shear = on("tip"), (case.stretch - 1) * LENGTH * unit, case.shear * LENGTH * unit
@@ -233,12 +239,16 @@ def _actions(
 
 def _contact(group: Group, case: Push, nodes: np.ndarray, shift: np.ndarray) -> Contact:
     """An obstacle a little below the beam, at three quarters of its length."""
-    unit, low = case.length, -0.5 * case.height(group)
-    shape = group.kind.split()[1] if group.kind in KNOBS and " " in group.kind else "disk"
-    place, more = {
-        "half-plane": ([0.25 * LENGTH, low - 0.05], np.array([0.0, 1.0])),
-        "disk": ([0.25 * LENGTH, low - 1.05], unit * np.array(1.0)),
-        "box": ([0.25 * LENGTH, low - 0.75], np.array([1.6 * unit, 1.2 * unit, 5.0])),
-    }.get(shape, ([0.0, 0.0], np.zeros(())))
-    stiffness = case.stiffness / LENGTH * case.stress / unit
-    return Contact(nodes, shape, unit * (np.array(place) + shift), more, stiffness, case.transition * LENGTH * unit)
+    unit, low = case.length, -0.5 * case.height(group) - 0.05
+    # No thinner than an edge of the beam's end.
+    size = max(case.size, 0.3 * case.height(group))
+    shape = group.kind.split()[1] if " " in group.kind else "disk"
+    depth, more = {
+        "half-plane": (0.0, np.array([0.0, 1.0])),
+        "disk": (size, np.array(size * unit)),
+        "box": (0.7 * size, np.array([1.6 * size * unit, 1.2 * size * unit, 5.0])),
+    }[shape]
+    place = unit * (np.array([0.25 * LENGTH, low - depth]) + shift)
+    stiffness, way = case.stiffness / LENGTH * case.stress / unit, np.deg2rad(case.toward)
+    transition = case.transition * LENGTH * unit
+    return Contact(nodes, shape, place, more, stiffness, transition, (np.cos(way), np.sin(way)))
