@@ -114,3 +114,16 @@ def sides(problem: Any, contact: Contact, moved: float, y: np.ndarray) -> Sides:
     if contact.shape == "disk":
         turns = turns + 1 / (gaps.reshape(turns.shape) + more[0])
     return Sides(gaps.reshape(turns.shape), np.sum(normals * out.reshape(points.shape), axis=2), turns)
+
+
+def swallowed(problem: Any, contact: Contact, moved: float, y: np.ndarray) -> bool:
+    """Whether the centre of a disk or a box lies in an element.
+
+    It has come in through the surface that it may touch. If that has closed behind it, `sides` has nothing to see.
+    """
+    if contact.shape == "half-plane":
+        return False
+    place, way = (contact.attached(problem)[1][k][0] for k in (1, 3))
+    a, b, c = np.moveaxis(y[np.asarray(problem.elements)[:, :3]] - (place + moved * way), 1, 0)
+    turns = [p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((a, b), (b, c), (c, a))]
+    return bool((np.min(turns, axis=0) >= 0).any())

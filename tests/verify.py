@@ -38,7 +38,7 @@ import jaxbeam as jb
 from tests.actions import Tendons
 from tests.energies import Facts, Problem, command_forces, density, facts, facts_from_first, total_energy
 from tests.geometry import crossings, surface
-from tests.obstacles import sides
+from tests.obstacles import sides, swallowed
 
 __all__ = ("Facts", "Problem", "Tendons", "Verdict", "density", "facts", "refuted_slope", "total_energy", "verify")
 
@@ -175,6 +175,11 @@ def _volume(claim: Claim, true: Facts) -> list[str]:
         refuted.append(f"INVERTED, but the smallest J is {volume:.3g}")
     if jb.Status.INVERTED not in claim.status and not volume > -slack:
         refuted.append(f"J = {volume:.3g}, but not INVERTED")
+        return refuted
+    y = claim.problem.relative(claim.x)
+    inside = [c for c, moved in claim.problem.contacts(claim.ratios) if swallowed(claim.problem, c, moved, y)]
+    if inside and jb.Status.INVERTED not in claim.status:
+        refuted.append(f"the {inside[0].shape} lies in the body, but not INVERTED")
     return refuted
 
 

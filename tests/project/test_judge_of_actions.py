@@ -261,6 +261,20 @@ def test_an_obstacle_in_the_body_is_refuted(shape):
         assert "INVERTED" not in found and "smallest J" not in found
 
 
+@pytest.mark.parametrize(("shape", "more"), [("disk", 0.25), ("box", [0.4, 0.3, 5.0])])
+def test_an_obstacle_that_the_body_has_closed_about_is_refuted(shape, more):
+    """No point of the surface is in it, and nothing pushes."""
+    raw, ratios = contact(shape)
+    answer = solve(raw, ratios)
+    small = dataclasses.replace(raw.actions[0], place=[2.5, -1.0], more=more)
+    raw, ratios = dataclasses.replace(raw, actions=(small,)), np.array([1.0, 0.0])
+    true = restated(raw, ratios, raw.nodes, reached=1.0)
+    assert words(raw, ratios, answer, **true) == f"the {shape} lies in the body, but not INVERTED"
+    # Beside the body it is no matter.
+    raw = dataclasses.replace(raw, actions=(dataclasses.replace(small, place=[2.5, -0.2]),))
+    assert words(raw, ratios, answer, **restated(raw, ratios, raw.nodes)) == ""
+
+
 def test_what_is_untouched_is_not_inverted():
     raw, ratios = contact("disk")
     answer = solve(raw, ratios)
