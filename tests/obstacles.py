@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.actions import Action, along, between, one_sided, told
+from tests.geometry import polylines, surface
 
 
 @lru_cache
@@ -117,13 +118,13 @@ def sides(problem: Any, contact: Contact, moved: float, y: np.ndarray) -> Sides:
 
 
 def swallowed(problem: Any, contact: Contact, moved: float, y: np.ndarray) -> bool:
-    """Whether the centre of a disk or a box lies in an element.
+    """Whether the surface goes round the centre of a disk or a box.
 
     It has come in through the surface that it may touch. If that has closed behind it, `sides` has nothing to see.
     """
     if contact.shape == "half-plane":
         return False
     place, way = (contact.attached(problem)[1][k][0] for k in (1, 3))
-    a, b, c = np.moveaxis(y[np.asarray(problem.elements)[:, :3]] - (place + moved * way), 1, 0)
-    turns = [p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((a, b), (b, c), (c, a))]
-    return bool((np.min(turns, axis=0) >= 0).any())
+    lines = polylines(y, surface(problem.elements)) - (place + moved * way)
+    (ax, ay), (bx, by) = np.moveaxis(lines[:, :-1], 2, 0), np.moveaxis(lines[:, 1:], 2, 0)
+    return bool(np.arctan2(ax * by - ay * bx, ax * bx + ay * by).sum() > np.pi)
