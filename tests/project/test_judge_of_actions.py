@@ -146,7 +146,11 @@ def test_energy_and_its_derivatives_are_the_librarys(name, order):
         np.testing.assert_allclose(true.hessian, rows[:, free], atol=1e-10 * true.stiffest)
 
 
-@pytest.mark.parametrize("name", SCENES)
+# Dear to compile; the order of its commands is compared above.
+DEAR = [pytest.param(name, marks=pytest.mark.slow) if name == "everything" else name for name in SCENES]
+
+
+@pytest.mark.parametrize("name", DEAR)
 def test_an_honest_answer_and_its_slope_are_accepted(name):
     raw, ratios = SCENES[name]()
     scene = scene_of(raw)
