@@ -18,8 +18,7 @@ What counts as round-off, with `eps` that of the dtype of the solve and `K` the 
 - `J`: positions are rounded by `eps max |x|`, which moves `J` by that over the height of the element;
 - slopes: `SLOPE`, and what positions are rounded by, over the size of the body, times the condition number of `K`;
 - commands: one between rest and the last of a ramp is rounded by `eps` of the larger of them, four times;
-- supports: a displacement is the product of two rounded numbers, added to a third, `2 eps` of the magnitudes; and
-  `HELD eps max |x|`, for a place that is reached by steps. The solver calls no less a gap (measured: up to 4);
+- supports: a displacement is the product of two rounded numbers, added to a third, `2 eps` of the magnitudes;
 - distances from an obstacle: differences of numbers as large as `max |x|`, its place and its radius, so that all that
   they decide is rounded by `eps` of the largest of these. A command may be that large too;
 - the side of an obstacle on which the surface is: cosines turn by what positions are rounded by, over the lengths of
@@ -46,7 +45,6 @@ FACTOR = 2.0
 EIGEN = 4.0
 FORCE = 1.5
 OFF = 5e-3
-HELD = 4.0
 SLOPE = 1e-6
 RTOL = {"float32": 1e-6, "float64": 1e-10}
 # Newton's method from `x`: how many steps it may take to settle, and what counts as settled.
@@ -147,7 +145,7 @@ def _state(claim: Claim, true: Facts) -> list[str]:
     # A walk that broke off has moved its supports as far as it came.
     moves = float(claim.answer.reached) * claim.problem.displacements(claim.ratios)
     rest = np.asarray(claim.problem.nodes, np.float64)
-    room = claim.eps * (HELD * claim.reach + 2 * (np.abs(rest) + np.abs(moves)))
+    room = 2 * claim.eps * (np.abs(rest) + np.abs(moves))
     astray = np.abs(claim.x - rest - moves) > room
     if (astray & claim.problem.held & ~fixed).any():
         refuted.append("a support is not where its command puts it")

@@ -197,6 +197,13 @@ class ContactEnergy(Energy):
 
         return jax.vmap(of_edge)(x, params)
 
+    def surrounded(self, x: jax.Array, points: jax.Array, params: ContactParams) -> jax.Array | None:
+        """The body lies deeper in the obstacle than its surface does. What has no thickness cannot be passed."""
+        if params.stride is None:
+            return None
+        surface = jnp.append(jax.vmap(self.gaps)(x, params), self.obstacle(x.reshape(-1, 2), params))
+        return jnp.min(self.obstacle(points, params)) < jnp.minimum(jnp.min(surface), 0)
+
     def valid(self, params: ContactParams) -> jax.Array:
         return jnp.all((params.stiffness > 0) & (params.transition > 0))
 

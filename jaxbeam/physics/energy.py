@@ -106,6 +106,16 @@ class Energy:
         """A quantity `(m,)` that must stay positive, such as the smallest `J` of an element; None: there is none."""
         return None
 
+    def surrounded(self, x: jax.Array, points: jax.Array, params: Any) -> jax.Array | None:
+        """Whether, `()`, the body has closed around what the stencils touch; None: never.
+
+        Args:
+            x: `(m, k, d)` positions of their nodes.
+            points: `(p, 2)` points within the body.
+            params: their parameters.
+        """
+        return None
+
     def longest_step(self, x: jax.Array, dx: jax.Array, params: Any, keep: float) -> jax.Array | None:
         """The largest `t` `(m,)` for which `x + t dx` keeps the fraction `keep` of the margin; None: no limit."""
         return None

@@ -93,6 +93,14 @@ def worst_element(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return every[element], element.astype(jnp.int32)
 
 
+def surrounded(scene: Scene, x: jax.Array) -> jax.Array | None:
+    """Whether, `()`, the body has closed around an obstacle that it touches; None if there is none."""
+    centres = jnp.mean(x[scene.mesh.elements], axis=1)
+    asked = [term.kind.surrounded(x[term.nodes], centres, term.params) for term in scene.terms]
+    found = [each for each in asked if each is not None]
+    return jnp.any(jnp.stack(found)) if found else None
+
+
 def largest_step(scene: Scene, x: jax.Array, dx: jax.Array, keep: float) -> jax.Array:
     """Largest `t` `()` for which every element keeps the fraction `keep` of its `J` on the way to `x + t dx`.
 

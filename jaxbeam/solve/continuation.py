@@ -21,7 +21,7 @@ from jax import lax
 
 from jaxbeam.core.compiling import choose
 from jaxbeam.linear.layout import Layout
-from jaxbeam.scene.evaluation import worst_element
+from jaxbeam.scene.evaluation import surrounded, worst_element
 from jaxbeam.scene.overlap import crossing
 from jaxbeam.scene.scene import Scene, commands_of, extent, has_supports, is_valid, longest_increment
 from jaxbeam.solve import newton
@@ -289,13 +289,16 @@ def _report(problem: Problem, state: Continuation, scene: Scene, attempt: newton
         halvings=spent.halvings + counts.halvings,
         attempts=spent.attempts + jnp.where(given_up, 0, 1),
         worst_element=element,
-        status=_flags(problem, state, attempt, volume) | last_flags,
+        status=_flags(problem, state, scene, attempt, volume) | last_flags,
     )
 
 
-def _flags(problem: Problem, state: Continuation, attempt: newton.State, volume: jax.Array) -> jax.Array:
+def _flags(problem: Problem, state: Continuation, scene: Scene, attempt: newton.State, volume: jax.Array) -> jax.Array:
     """Status flags `()` of an attempt, or-ed; `volume` `()` is the smallest `J`."""
     converged = (attempt.residual <= problem.solver.tolerance(attempt.x.dtype)) & ~state.given_up
+    if (inside := surrounded(scene, attempt.x)) is not None:
+        # No state to go on from: the obstacle might leave the body on its other side.
+        converged, volume = converged & ~inside, jnp.where(inside, -jnp.inf, volume)
     finite = jnp.isfinite(attempt.evaluation.energy) & jnp.all(jnp.isfinite(attempt.evaluation.gradient))
     definite, marginal = attempt.stiffness.definite, attempt.stiffness.marginal
     inaccurate = marginal | attempt.singular | (definite & (attempt.correction > INACCURATE))

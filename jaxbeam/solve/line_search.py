@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxbeam.core.compiling import choose
-from jaxbeam.scene.evaluation import Evaluation, evaluate, largest_step
+from jaxbeam.scene.evaluation import Evaluation, evaluate, largest_step, surrounded
 from jaxbeam.scene.scene import Scene
 
 # Armijo's condition asks for this share of the decrease that the slope predicts.
@@ -55,7 +55,7 @@ def line_search(
     full: jax.Array,
     keep_volume: float,
 ) -> SearchResult:
-    """Take a step, halved until the energy falls.
+    """Take a step, halved until the energy falls and the body does not close around an obstacle.
 
     The first length tried is the largest, up to 1, at which no element loses more volume than `keep_volume` allows.
 
@@ -85,7 +85,12 @@ def line_search(
         armijo = new.energy <= evaluation.energy + ARMIJO * length * slope
         flat = (new.energy <= evaluation.energy + round_off) & (new_slope <= (2 * APPROXIMATE_WOLFE - 1) * slope)
         finite = jnp.isfinite(new.energy) & jnp.isfinite(new_slope)
-        return count + 1, new_x, new, initial | ((armijo | flat | full) & finite)
+        accepted = initial | ((armijo | flat | full) & finite)
+        if (inside := surrounded(scene, new_x)) is not None:
+            # The body may not pass an obstacle. Of the way to the start of the method the least is accepted all the
+            # same, because there is no evaluation before it.
+            accepted &= ~inside | (initial & (count == MAX_HALVINGS))
+        return count + 1, new_x, new, accepted
 
     begin = (jnp.zeros((), jnp.int32), x, evaluation, ~downhill)
     going = lambda carry: ~carry[3] & (carry[0] <= MAX_HALVINGS)

@@ -235,6 +235,8 @@ def step(problem: Problem, state: State) -> State:
     x, evaluation, halvings, moved = line_search(
         scene, state.x, state.evaluation, state.step, forced, full, solver.keep_volume
     )
+    if problem.places is not None:
+        x = jnp.where(scene.held & (_gap(problem, x) == 0), problem.places, x)
     unbalanced = jnp.max(jnp.abs(jnp.where(scene.held, 0, evaluation.gradient)))
     allowed = rtol * force_scale(scene, evaluation)
     balanced = unbalanced <= allowed

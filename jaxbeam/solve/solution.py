@@ -17,7 +17,7 @@ class Status(enum.IntFlag):
     OK: nothing.
     NOT_CONVERGED: no equilibrium was found.
     NONFINITE: energy or forces are not finite.
-    INVERTED: an element has `J <= 0`.
+    INVERTED: an element has `J <= 0`, or an obstacle lies within the body.
     UNSTABLE: the equilibrium is a saddle.
     INVALID: a parameter of the scene is out of its range.
     INACCURATE: round-off leaves positions or stability uncertain.
@@ -39,8 +39,8 @@ REMEDIES = {
     "approach the command by ramp(scene, ratios, steps) with more steps, raise Newton.max_steps, or command less",
     Status.NONFINITE: "energy or forces are not finite: check parameters and x0, which must not invert an element "
     "of a logarithmic material",
-    Status.INVERTED: "an element is turned inside out (J <= 0): command less, approach it by ramp, use a finer mesh "
-    "or a material that resists it, such as neo_hookean",
+    Status.INVERTED: "an element is turned inside out (J <= 0), or an obstacle lies within the body: command less, "
+    "approach it by ramp, use a finer mesh, a material that resists it, such as neo_hookean, or stiffer contact",
     Status.UNSTABLE: "the equilibrium is a saddle, which a real beam leaves: set Newton(escape=True), or start from "
     "x0 = x + a little of lowest_mode(scene, x)",
     Status.INACCURATE: "forces balance to round-off, but positions are still uncertain by more than a thousandth of "

@@ -187,6 +187,22 @@ def test_the_wrong_side_is_told():
         jb.equilibrium(scene, scene.mesh.nodes + 1e-9)
 
 
+@pytest.mark.parametrize(("stiffness", "way", "far"), [(30.0, 0.4, 1.0), (3000.0, 1.2, 2.0)])
+def test_an_obstacle_does_not_pass_through_the_body(stiffness, way, far):
+    """A disk pushed in so far that the body would rather let it through: the answer at rest, with the disk in the body
+    or on its other side, is no answer. It breaks off where the body gives way."""
+    mesh = jb.rectangle(3.5, 0.8, 7, 4, order=2)
+    nodes = np.asarray(mesh.nodes)
+    below, left = np.flatnonzero(nodes[:, 1] < -0.3999), np.flatnonzero(nodes[:, 0] < -1.7499)
+    push = jb.contact(mesh, below, jb.disk([0.875, -0.85], 0.4), stiffness, 1e-3, direction=[-0.5, 0.866])
+    scene = jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e4, 0.45)), push), jb.clamped(mesh, left))
+    near = jb.check(jb.equilibrium(jb.command(scene, [way])))
+    assert float(near.x[-1, 1] - nodes[-1, 1]) > 0.03
+    for found in (jb.equilibrium(jb.command(scene, [far])), jax.tree.map(lambda a: a[-1], jb.ramp(scene, [far], 28))):
+        assert int(found.status) & jb.Status.NOT_CONVERGED and way / far < float(found.reached) < 1
+        assert np.abs(np.asarray(found.x) - nodes).max() > 0.03
+
+
 def test_slope_in_the_radius():
     load = lambda r: (
         -jnp.sum(jb.contact_forces(s := jb.command(pressed(1e6, r[0]), [-0.02]), jb.equilibrium(s).x), axis=0)[1]
