@@ -251,6 +251,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     plan = [(g, min(g.count, options.cases)) for g in groups() if options.only in str(g)]
+    if not plan:
+        parser.error(f"no group's name contains {options.only!r}; there are {sorted({g.kind for g in groups()})}")
     if options.quick:
         # The first group of each kind that is not tiny.
         kinds = {g.kind: g for g, _ in reversed(plan) if g.nx >= 5}
