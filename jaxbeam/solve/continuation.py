@@ -297,8 +297,9 @@ def _flags(problem: Problem, state: Continuation, scene: Scene, attempt: newton.
     """Status flags `()` of an attempt, or-ed; `volume` `()` is the smallest `J`."""
     converged = (attempt.residual <= problem.solver.tolerance(attempt.x.dtype)) & ~state.given_up
     if (inside := surrounded(scene, attempt.x)) is not None:
-        # No state to go on from: the obstacle might leave the body on its other side.
-        converged, volume = converged & ~inside, jnp.where(inside, -jnp.inf, volume)
+        # No state to go on from: the obstacle might leave the body on its other side. The state of a target that is
+        # given up belongs to other commands, under which the obstacle was elsewhere.
+        converged, volume = converged & ~inside, jnp.where(inside & ~state.given_up, -jnp.inf, volume)
     finite = jnp.isfinite(attempt.evaluation.energy) & jnp.all(jnp.isfinite(attempt.evaluation.gradient))
     definite, marginal = attempt.stiffness.definite, attempt.stiffness.marginal
     inaccurate = marginal | attempt.singular | (definite & (attempt.correction > INACCURATE))
