@@ -20,7 +20,7 @@ from jaxbeam.core.tree import Numbers, index_field, namespace, pytree, replace, 
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
 from jaxbeam.physics.energy import Term
-from jaxbeam.physics.tendon import LineEnergy, tendons
+from jaxbeam.physics.tendon import LineEnergy, tendons, without_filling
 
 
 @pytree
@@ -64,7 +64,7 @@ class PullEnergy(LineEnergy):
         if params.width is None:
             return term
         tension = params.tension[0] if self.shared_command else params.tension
-        return pulls(mesh, params.ends, tension, np.asarray(params.width), self.shared_command)
+        return pulls(mesh, without_filling(params.ends), tension, np.asarray(params.width), self.shared_command)
 
 
 @usual_rules

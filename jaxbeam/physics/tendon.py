@@ -173,7 +173,7 @@ class TendonEnergy(LineEnergy):
         if params.width is None:
             return term
         width = np.asarray(params.width)
-        new = tendons(mesh, params.ends, params.modulus, self.stiffness, width, self.shared_command)
+        new = tendons(mesh, without_filling(params.ends), params.modulus, self.stiffness, width, self.shared_command)
         params = replace(new.params, natural=params.natural, commanded=params.commanded)
         return Term(self, new.nodes, params)
 
@@ -268,6 +268,11 @@ def check_lines(mesh: Mesh, nodes: Any) -> np.ndarray:
             raise ValueError(f"nodes: tendon {k} repeats a node: {row.tolist()}; give each of its points once")
     most = max(len(row) for row in rows)
     return np.stack([np.append(row, np.full(most - len(row), row[-1])) for row in rows])
+
+
+def without_filling(lines: np.ndarray) -> list[np.ndarray]:
+    """The rows of lines `(m, k)` as they were given to `check_lines`."""
+    return [row[: 1 + int(np.flatnonzero(row != row[-1])[-1]) + 1] for row in np.asarray(lines)]
 
 
 def _patch_means(mesh: Mesh, lines: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -97,6 +97,16 @@ def test_lines_of_different_lengths_with_widths():
     np.testing.assert_allclose(jb.tendon_lengths(scene, BEAM.mesh.nodes), jb.tendon_lengths(apart, BEAM.mesh.nodes))
 
 
+@pytest.mark.parametrize("build", [jb.tendons, jb.cables, jb.pulls])
+def test_lines_of_different_lengths_are_refined(build):
+    rows, width = [[4, 24, 34], [0, 20]], [[0.0, 0.2, 0.2], [0.0, 0.3, 0.3]]
+    term = build(BEAM.mesh, rows, 50.0, width=width)
+    scene = jb.Scene(BEAM.mesh, (BEAM.terms[0], term), BEAM.fixed, BEAM.tip)
+    finer, _ = jb.enriched(scene)
+    x = scene.mesh.nodes
+    np.testing.assert_allclose(jb.tendon_lengths(finer, finer.mesh.nodes), jb.tendon_lengths(scene, x), rtol=1e-12)
+
+
 def test_a_cable_through_guides_on_its_way_is_the_straight_one():
     """Guides on the line between its ends, at rest and while it is moved as a whole."""
     straight, guided = jb.tendons(BEAM.mesh, [[4, 24]], 2e3), jb.tendons(BEAM.mesh, [[4, 9, 14, 19, 24]], 2e3)
