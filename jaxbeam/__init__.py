@@ -9,12 +9,20 @@ from types import ModuleType as _ModuleType
 
 from jaxbeam.linear.dense import Dense as Dense
 from jaxbeam.linear.tridiagonal import BlockTridiagonal as BlockTridiagonal
+from jaxbeam.mesh.bodies import joined as joined
+from jaxbeam.mesh.bodies import mapped as mapped
+from jaxbeam.mesh.bodies import without as without
 from jaxbeam.mesh.mesh import Mesh as Mesh
+from jaxbeam.mesh.mesh import elements_where as elements_where
 from jaxbeam.mesh.mesh import nearest_node as nearest_node
 from jaxbeam.mesh.mesh import nodes_where as nodes_where
 from jaxbeam.mesh.rectangle import rectangle as rectangle
 from jaxbeam.mesh.refinement import quadratic as quadratic
 from jaxbeam.mesh.refinement import refined as refined
+from jaxbeam.mesh.sides import along as along
+from jaxbeam.mesh.sides import arc_lengths as arc_lengths
+from jaxbeam.mesh.sides import side as side
+from jaxbeam.mesh.sides import surface_lines as surface_lines
 from jaxbeam.physics.cable import cables as cables
 from jaxbeam.physics.contact import Obstacle as Obstacle
 from jaxbeam.physics.contact import box as box
@@ -63,9 +71,15 @@ from jaxbeam.scene.measures import tendon_slack as tendon_slack
 from jaxbeam.scene.measures import tendon_tensions as tendon_tensions
 from jaxbeam.scene.measures import tip_angle as tip_angle
 from jaxbeam.scene.measures import tip_position as tip_position
+from jaxbeam.scene.points import Marker as Marker
+from jaxbeam.scene.points import curvature as curvature
+from jaxbeam.scene.points import marker as marker
 from jaxbeam.scene.scene import Scene as Scene
 from jaxbeam.scene.scene import clamped as clamped
 from jaxbeam.scene.scene import command as command
+from jaxbeam.scene.stress import out_of_plane_stress as out_of_plane_stress
+from jaxbeam.scene.stress import principal_stretches as principal_stretches
+from jaxbeam.scene.stress import von_mises_stress as von_mises_stress
 from jaxbeam.solve.equilibrium import equilibrium as equilibrium
 from jaxbeam.solve.equilibrium import linear_response as linear_response
 from jaxbeam.solve.newton import Newton as Newton

@@ -100,13 +100,44 @@ def nodes_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.nda
     [0, 1]
     """
     checks.function("predicate", predicate, "(x, y) -> booleans")
-    x, y = _concrete_nodes(mesh).T
+    return _selected(predicate, _concrete_nodes(mesh), "node")
+
+
+def elements_where(mesh: Mesh, predicate: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Numbers of the elements whose centre satisfies `predicate(x, y)`, in increasing order.
+
+    They select entries of what is given for each element, such as Young's modulus in `lame`.
+
+    Args:
+        mesh: of triangles, with concrete nodes.
+        predicate: takes the coordinates `x` and `y` of the centres, each `(t,)`, and returns `(t,)` booleans. The
+            centre is the mean of the corners at rest.
+
+    Raises:
+        ValueError: if the predicate returns another shape or selects nothing, the nodes are traced, or `mesh` is the
+            line of a rod.
+
+    >>> import jaxbeam as jb
+    >>> beam, young = jb.rectangle(4.0, 1.0, 5, 2), np.full(8, 1e4)
+    >>> young[elements_where(beam, lambda x, y: x > 0)] = 1e3
+    >>> [float(modulus) for modulus in young]
+    [10000.0, 10000.0, 10000.0, 10000.0, 1000.0, 1000.0, 1000.0, 1000.0]
+    """
+    checks.function("predicate", predicate, "(x, y) -> booleans")
+    check_triangles(mesh)
+    nodes, corners = _concrete_nodes(mesh), element_of(mesh.elements).corners
+    return _selected(predicate, nodes[mesh.elements[:, :corners]].mean(axis=1), "element")
+
+
+def _selected(predicate: Callable[..., Any], points: np.ndarray, what: str) -> np.ndarray:
+    """Numbers of the points that satisfy a predicate; `what` they stand for, for the message."""
+    x, y = points.T
     mask = np.asarray(predicate(x, y))
     if mask.shape != x.shape or mask.dtype != bool:
         raise ValueError(f"predicate: expected {x.shape} booleans, got shape {mask.shape} of dtype {mask.dtype}")
     if not mask.any():
         raise ValueError(
-            f"predicate: selects no node; x spans [{x.min():g}, {x.max():g}], y spans [{y.min():g}, {y.max():g}]"
+            f"predicate: selects no {what}; x spans [{x.min():g}, {x.max():g}], y spans [{y.min():g}, {y.max():g}]"
         )
     return np.flatnonzero(mask)
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.core.tree import Numbers, is_concrete, namespace
+from jaxbeam.mesh.bodies import Shape, mapped
 from jaxbeam.mesh.line import straight
 from jaxbeam.mesh.mesh import with_middles
 from jaxbeam.mesh.rectangle import Diagonals, middle_column, rectangle
@@ -40,6 +41,7 @@ def tendon_beam(
     density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
     dtype: Any = None,
+    shape: Shape | None = None,
 ) -> Scene:
     """The reference scene: a cantilever clamped at its left edge, with a tendon along half of each side.
 
@@ -65,15 +67,25 @@ def tendon_beam(
         density: the material, see `jaxbeam.physics.materials`.
         stiffness: the law of the tendons, see `tendons`.
         dtype: of everything computed; by default JAX's float.
+        shape: a map `(x, y) -> (x, y)` from the rectangle, which is centred on the origin, to the body at rest, such as
+            a taper (see `mapped`). Clamp, tip and the ends of the tendons move with it. A tendon is a straight line
+            between its ends also in a bent body; for guides along the surface use `side`, `along` and `tendons`.
 
     Returns:
-        A `Scene`, differentiable in every real argument.
+        A `Scene`, differentiable in every real argument, and in all that `shape` uses.
 
     Raises:
-        ValueError: if `nx` is even and the mesh not graded, or as `rectangle`, `lame` and `tendons` do.
+        ValueError: if `nx` is even and the mesh not graded, an anchor of finite width is asked for on a body whose
+            length, height or shape is traced, or as `rectangle`, `mapped`, `lame` and `tendons` do.
     """
     mesh = rectangle(length, height, nx, ny, diagonals, dtype, order=order, graded=graded)
+    mesh = mesh if shape is None else mapped(mesh, shape)
     anchor_width = checks.setting("anchor_width", anchor_width, checks.NOT_NEGATIVE)
+    if anchor_width and not is_concrete(mesh.nodes):
+        raise ValueError(
+            f"anchor_width: expected 0 on a body whose length, height or shape is traced, got {anchor_width:g}: an "
+            f"anchor of finite width needs concrete nodes; build the scene outside jit and grad, or use 0"
+        )
     bottom_left, top_left = 0, ny - 1
     bottom_middle = middle_column(nx, graded) * ny
     body = solid(mesh, lame(young, poisson), density, degree)
