@@ -37,7 +37,8 @@ def mapped(mesh: Mesh, shape: Shape) -> Mesh:
 
     Raises:
         ValueError: if `shape` returns anything else, or turns triangles inside out, folds them over or makes them
-            overlap. Traced results with such a fault become NaN as in `Mesh`, and every solution is then `INVALID`.
+            overlap. Traced results with such a fault become NaN as in `Mesh`, and every solution is then `INVALID`. If
+            results are traced or edges curved, overlaps of distant parts are found by solvers only (`OVERLAPPING`).
 
     >>> import jaxbeam as jb
     >>> tapered = mapped(jb.rectangle(2.0, 1.0, 3, 2), lambda x, y: (x, y * (1 - 0.2 * x)))
@@ -84,7 +85,7 @@ def _check_mapped(before: np.ndarray | None, nodes: np.ndarray, mesh: Mesh) -> N
         )
     kind, area = element_of(mesh.elements).name, _areas(nodes, mesh.elements)
     turned = np.flatnonzero(area <= 0)
-    if turned.size == len(area):
+    if turned.size == len(area) and (area < 0).all():
         raise ValueError(
             f"shape: it makes a mirror image, in which every {kind} is inside out; change the sign of one of the two "
             f"coordinates that it returns"
@@ -92,8 +93,8 @@ def _check_mapped(before: np.ndarray | None, nodes: np.ndarray, mesh: Mesh) -> N
     if turned.size:
         k = mesh.elements[turned[0], 0]
         raise ValueError(
-            f"shape: it turns {turned.size} of {len(area)} {kind}s inside out, the first is {kind} {turned[0]} with "
-            f"node {k}{where(k)}; expected a map whose derivative has a positive determinant everywhere: make it "
+            f"shape: it turns {turned.size} of {len(area)} {kind}s inside out or flat, the first is {kind} {turned[0]} "
+            f"with node {k}{where(k)}; expected a map whose derivative has a positive determinant everywhere: make it "
             f"change less steeply there"
         )
 

@@ -139,10 +139,10 @@ def arc_lengths(mesh: Mesh, nodes: Numbers) -> Any:
     """
     check_triangles(mesh)
     line = checks.node_numbers("nodes", len(mesh.nodes), nodes, 1)
-    edges, pieces = _edges_along(mesh, line)
     xp = namespace(mesh.nodes)
     if len(line) == 1:
         return xp.zeros(1, mesh.nodes.dtype)
+    edges, pieces = _edges_along(mesh, line)
     (points, shares), parts = edge_rule(POINTS), edges.shape[1] - 1
     xi = (pieces[:, None] + points) / parts
     rest = xp.asarray(mesh.nodes)[edges]
@@ -175,8 +175,8 @@ def _edges_along(mesh: Mesh, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 f"line in order, such as those of side(mesh, start, end)"
             )
         found.append(known[a, b])
-    edges, pieces = zip(*found, strict=True) if found else ((), ())
-    return np.array(edges, int).reshape(len(found), -1), np.array(pieces, int)
+    edges, pieces = zip(*found, strict=True)
+    return np.array(edges), np.array(pieces)
 
 
 def along(mesh: Mesh, nodes: Numbers, distances: Numbers, corners: bool = False) -> np.ndarray:

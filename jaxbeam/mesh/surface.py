@@ -159,12 +159,15 @@ def finer_edges(mesh: Mesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         The edges, in order; and for each the index of the coarse edge on which it lies.
     """
-    following = {line[0]: line for line in surface(mesh).tolist()}
+    following: dict[int, list[list[int]]] = {}
+    for line in surface(mesh).tolist():
+        following.setdefault(line[0], []).append(line)
     found, parents = [], []
     for parent, (start, end) in enumerate(edges[:, :2].tolist()):
-        here = start
-        while here != end:
-            found.append(following[here])
-            parents.append(parent)
-            here = following[here][1]
+        # Where two parts of the surface touch at a node, two edges begin there. The shortest way is that of the edge.
+        ways = [[line] for line in following[start]]
+        while not (whole := [way for way in ways if way[-1][1] == end]):
+            ways = [[*way, line] for way in ways for line in following[way[-1][1]]]
+        found += whole[0]
+        parents += [parent] * len(whole[0])
     return np.array(found), np.array(parents)
