@@ -216,8 +216,9 @@ def test_a_marker_refuses_other_meshes():
         jax.jit(lambda p: jb.marker(scene_of(FLAT), p)(scene_of(FLAT), FLAT.nodes))(jnp.zeros(2))
 
 
+@pytest.mark.slow
 def test_a_marker_is_a_measure():
-    """`reach` finds commands for the place of a point of the body, and `estimate_error` a bar for it."""
+    """`reach` finds the commands for the place of a point of the body."""
     scene = jb.tendon_beam(5, 3)
     point = jb.marker(scene, [1.2, 0.1])
     goal = point(scene, jb.equilibrium(jb.command(scene, [0.8, 1.0])).x)
