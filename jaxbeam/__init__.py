@@ -2,7 +2,8 @@
 
 Each folder is a room. Read them in the order core, mesh, physics, scene, linear, solve, study: a room imports only from
 rooms before it. The names below are all that a user needs.
-Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib.
+Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib. Files are read and written by
+`jaxbeam.files`, which is imported by itself too.
 """
 
 from types import ModuleType as _ModuleType

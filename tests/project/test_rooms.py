@@ -21,6 +21,7 @@ BELOW = {
     "solve": {"core", "mesh", "physics", "scene", "linear"},
     "study": {"core", "mesh", "physics", "scene", "linear", "solve"},
     "plot": {"core", "mesh", "physics", "scene", "linear", "solve", "study"},
+    "files": {"core", "mesh", "physics", "scene", "linear", "solve"},
 }
 
 
@@ -71,8 +72,9 @@ def test_a_room_imports_from_rooms_below(name):
     assert not upwards
 
 
-def test_matplotlib_is_needed_by_pictures_alone():
-    assert "plot" not in {room(module) for module in IMPORTS["jaxbeam"]}
+def test_pictures_and_files_are_imported_by_name_alone():
+    """Matplotlib and meshio are needed by nothing else."""
+    assert not {"plot", "files"} & {room(module) for module in IMPORTS["jaxbeam"]}
 
 
 def test_no_import_is_cyclic():
