@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -192,6 +193,16 @@ def term_of(mesh: jb.Mesh, action: Action) -> jb.Term:
 
 
 # --------------------------------------------------------------------------- references made otherwise
+
+
+def solution_of(scene: jb.Scene, ratios: np.ndarray, x: np.ndarray, status: np.ndarray) -> jb.Solution:
+    """A solution made by hand, for what needs no equilibrium: of one state, or of many along a leading axis."""
+    batch, dtype = np.shape(status), scene.mesh.nodes.dtype
+    fields = {field.name: jnp.zeros(batch, dtype) for field in dataclasses.fields(jb.Solution)}
+    for name in ("steps", "projected", "halvings", "attempts", "worst_element"):
+        fields[name] = jnp.ones(batch, jnp.int32)
+    fields |= {"crossing": jnp.full((*batch, 2, 2), -1, jnp.int32), "status": jnp.asarray(status, jnp.int32)}
+    return jb.Solution(**fields | {"ratios": jnp.asarray(ratios, dtype), "x": jnp.asarray(x, dtype)})
 
 
 def central_difference(f, x: np.ndarray, h: float) -> np.ndarray:
