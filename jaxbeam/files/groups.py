@@ -7,9 +7,7 @@ once; in format 2 it reports numbers alone. So the names are read here, from the
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,15 +20,6 @@ PREFIX = "group:"
 _DIMENSIONS = ("point", "line", "surface", "volume")
 
 
-def physical_names(file: Path) -> dict[tuple[int, int], str]:
-    """Names of the physical groups of a Gmsh file, by dimension and number. They are text, also in a binary file."""
-    if file.suffix.lower() != ".msh":
-        return {}
-    section = re.search(rb"\$PhysicalNames\s+(.*?)\$EndPhysicalNames", file.read_bytes(), re.DOTALL)
-    text = section[1].decode(errors="replace") if section else ""
-    return {(int(d), int(tag)): name for d, tag, name in re.findall(r'^\s*(\d+)\s+(\d+)\s+"(.*)"\s*$', text, re.M)}
-
-
 def parts(found: Any, names: dict[tuple[int, int], str]) -> Iterator[tuple[str, int, np.ndarray]]:
     """The groups of what meshio read, in parts.
 
@@ -38,10 +27,11 @@ def parts(found: Any, names: dict[tuple[int, int], str]) -> Iterator[tuple[str, 
         The name of a group, the index of a block of cells, and the indices of the cells of that block in the group.
     """
     for name, chosen in found.cell_sets.items():
-        if not name.startswith("gmsh:"):
+        # A set of Abaqus may have no name.
+        if not str(name).startswith("gmsh:"):
             for block, cells in enumerate(chosen):
                 if cells is not None and len(cells):
-                    yield name, block, np.asarray(cells, dtype=np.int64)
+                    yield str(name), block, np.asarray(cells, dtype=np.int64)
     for block, tags in enumerate(found.cell_data.get("gmsh:physical", [])):
         dimension = found.cells[block].dim
         for tag in np.unique(tags).tolist():
@@ -53,7 +43,7 @@ def parts(found: Any, names: dict[tuple[int, int], str]) -> Iterator[tuple[str, 
 def node_parts(found: Any) -> Iterator[tuple[str, np.ndarray]]:
     """Groups of nodes that the file holds as such: their names and node numbers."""
     for name, nodes in found.point_sets.items():
-        yield name, np.asarray(nodes, dtype=np.int64).ravel()
+        yield str(name), np.asarray(nodes, dtype=np.int64).ravel()
     for name, values in found.point_data.items():
         if name.startswith(PREFIX) and np.ndim(values) == 1:
             yield name.removeprefix(PREFIX), np.flatnonzero(values)

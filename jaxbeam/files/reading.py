@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.tree import to_device
-from jaxbeam.files import disk, groups
+from jaxbeam.files import disk, gmsh, groups
 from jaxbeam.mesh.mesh import Mesh
 
 # Nodes of each kind of triangle, by meshio's name for it.
@@ -112,10 +112,9 @@ def _parsed(file: Path) -> Any:
             warnings.simplefilter("ignore")
             # NumPy's word for text that breaks off, or is no number.
             warnings.filterwarnings("error", message=".*unmatched data")
-            # Files of ANSYS have the same suffix as those of Gmsh, which begin with a dollar sign.
-            with open(file, "rb") as stream:
-                is_gmsh = file.suffix.lower() == ".msh" and stream.read(1) == b"$"
-            found = meshio.read(file, "gmsh" if is_gmsh else None)
+            if gmsh.is_gmsh(file):
+                gmsh.check_counts(file)
+            found = meshio.read(file, "gmsh" if gmsh.is_gmsh(file) else None)
     except ImportError as error:
         # Formats on HDF5 need h5py, which meshio does not bring along.
         raise ImportError(f"reading {file.name} takes one more package: {error}; install it") from error
@@ -275,7 +274,7 @@ def _groups(
     for name, those in groups.node_parts(found):
         _check_within(file, f"the group {name}", those, len(node_number), "node")
         nodes.append((name, node_number[those]))
-    for name, block, cells in groups.parts(found, groups.physical_names(file)):
+    for name, block, cells in groups.parts(found, gmsh.physical_names(file)):
         _check_within(file, f"the group {name}", cells, len(found.cells[block].data), "element")
         if block in start:
             elements.append((name, element_number[start[block] + cells]))

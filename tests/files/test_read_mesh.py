@@ -263,6 +263,24 @@ def test_damaged_files(tmp_path, capfd, name):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(
+    ("version", "old", "new"),
+    [
+        (2, "\n5 0.707", "\n2000000000 0.707"),
+        (4, "\n5\n6\n7\n0.707", "\n4000000000\n6\n7\n0.707"),
+        (4, "\n8 23 1 23\n", "\n8 2300000000 1 23\n"),
+        (4, "\n2 1 9 7\n", "\n2 1 9 700000000\n"),
+    ],
+)
+def test_counts_and_tags_that_a_file_cannot_hold(tmp_path, version, old, new):
+    """meshio would make arrays as long as these numbers say, of gigabytes."""
+    text = (HERE / f"half_disk_{version}.msh").read_text()
+    assert old in text
+    (tmp_path / "a.msh").write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=r"a\.msh cannot be read as a mesh \(.*more than the file can hold"):
+        files.read_mesh(tmp_path / "a.msh", clean=True)
+
+
 def test_groups_of_some_parts_alone(tmp_path):
     text = (HERE / "half_disk_4.msh").read_text()
     # The surface loses its group, as Gmsh writes it with Mesh.SaveAll.
