@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxbeam.plot.acting import Acting, to_one_scale
-from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _doing, _fit, _legend, _panels, _prepare, _ratios, limits
+from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _commands, _doing, _fit, _legend, _panels, _prepare, limits
 from jaxbeam.plot.lines import extremes
 from jaxbeam.plot.loads import draw_acting
 from jaxbeam.plot.states import States
@@ -124,7 +124,9 @@ def _play(
         for ax, artists, outer, each, does in zip(axes, beams, around, states, doing, strict=True):
             artists.move(each.x[frame], does[frame])
             outer(frame)
-            ax.set_title("\n".join(filter(None, [each.title, _ratios(each.commands[frame])])), fontsize="medium")
+            ax.set_title(
+                "\n".join(filter(None, [each.title, _commands(each.scene, each.commands[frame])])), fontsize="medium"
+            )
         trace(frame)
 
     # Lay out the panels once: a new layout for every frame would be slow, and the panels would jitter.

@@ -28,7 +28,7 @@ from jaxbeam.plot.lines import (
     term_lines,
 )
 from jaxbeam.plot.loads import force_handle
-from jaxbeam.scene.scene import Scene, placed
+from jaxbeam.scene.scene import Scene, commanded_terms, placed
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
@@ -224,6 +224,7 @@ def _legend(figure: Figure, acting: Sequence[Acting], doing: Sequence[np.ndarray
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False)
 
 
-def _ratios(ratios: np.ndarray) -> str:
-    """A title that states the commands `(m,)`."""
-    return "ratios " + ", ".join(f"{ratio:.2f}" for ratio in ratios)
+def _commands(scene: Scene, commands: np.ndarray) -> str:
+    """A title that states the commands `(m,)` of a scene, as ratios if all of them are."""
+    ratios = all(term.kind.command_unit == 1 for term in commanded_terms(scene))
+    return ("ratios " if ratios else "commands ") + ", ".join(f"{command:.2f}" for command in commands)

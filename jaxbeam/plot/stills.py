@@ -27,13 +27,13 @@ from jaxbeam.plot.drawing import (
     UNSTABLE,
     Limits,
     _Beam,
+    _commands,
     _doing,
     _fit,
     _legend,
     _panels,
     _positions,
     _prepare,
-    _ratios,
     limits,
 )
 from jaxbeam.plot.lines import elements_of, extremes
@@ -241,7 +241,7 @@ def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 
     Raises:
         ValueError: if the titles are not one for each state, or `columns` is less than 1.
     """
-    titles = [_ratios(ratios) for ratios in states.commands] if titles is None else titles
+    titles = [_commands(states.scene, row) for row in states.commands] if titles is None else titles
     if len(titles) != len(states):
         raise ValueError(f"titles: expected {len(states)}, one for each state, got {len(titles)}")
     if columns < 1:

@@ -19,6 +19,9 @@ NUMBERS = {
     "08_gradient_check": {"top command": -37.0783, "bottom command": 6.6988, "Hessian's order": 3.00},
     "09_sweep_many": {"solved": 1.0, "highest": 35.5152802, "lowest": -34.9502718},
     "10_speed_against_accuracy": {"exact": 10.14, "bar held": 1.0},
+    "11_finger": {"first": 0.6597, "second": 0.6692, "third": 0.6787, "curled tip missed by": 27.1},
+    "13_gripper": {"ratio": 0.84478, "tension": 196.60},
+    "14_pneumatic": {"pressure": 1288.04, "ratio": 0.8196, "tips apart": 0.684},
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
@@ -31,6 +34,9 @@ PICTURES = {
     "08_gradient_check": {"gradient_check.png"},
     "09_sweep_many": {"map.png", "reachable_set.png"},
     "10_speed_against_accuracy": {"speed_against_accuracy.png"},
+    "11_finger": {"finger.png", "finger.gif"},
+    "13_gripper": {"gripper.png", "gripper.gif"},
+    "14_pneumatic": {"pneumatic.png", "pneumatic.gif"},
 }
 
 
