@@ -20,6 +20,7 @@ NUMBERS = {
     "09_sweep_many": {"solved": 1.0, "highest": 35.5152802, "lowest": -34.9502718},
     "10_speed_against_accuracy": {"exact": 10.14, "bar held": 1.0},
     "11_finger": {"first": 0.6597, "second": 0.6692, "third": 0.6787, "curled tip missed by": 27.1},
+    "12_tentacle": {"lowest ratio": 0.7177, "top": 0.0445, "bottom": 0.1042},
     "13_gripper": {"ratio": 0.84478, "tension": 196.60},
     "14_pneumatic": {"pressure": 1288.04, "ratio": 0.8196, "tips apart": 0.684},
 }
@@ -35,6 +36,7 @@ PICTURES = {
     "09_sweep_many": {"map.png", "reachable_set.png"},
     "10_speed_against_accuracy": {"speed_against_accuracy.png"},
     "11_finger": {"finger.png", "finger.gif"},
+    "12_tentacle": {"tentacle.png", "tentacle.gif"},
     "13_gripper": {"gripper.png", "gripper.gif"},
     "14_pneumatic": {"pneumatic.png", "pneumatic.gif"},
 }
