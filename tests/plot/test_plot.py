@@ -16,6 +16,7 @@ from helpers import MATERIALS
 from matplotlib.animation import FFMpegWriter
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from pictures import frames_of
 from PIL import Image
 
 import jaxbeam as jb
@@ -46,14 +47,6 @@ def inside(points, bounds):
     (x0, x1), (y0, y1) = bounds
     x, y = np.asarray(points).reshape(-1, 2).T
     return (x0 < x).all() and (x < x1).all() and (y0 < y).all() and (y < y1).all()
-
-
-def frames_of(animation):
-    """Axis limits of the panels, frame by frame, as the animation is drawn."""
-    animation._draw_was_started = True  # it is not saved here, and matplotlib warns of that
-    for frame in animation.new_frame_seq():
-        animation._draw_frame(frame)
-        yield frame, [ax for ax in animation._fig.axes if ax.get_aspect() == 1]
 
 
 def run(code):
