@@ -100,6 +100,8 @@ from jaxbeam.study.branch import Branch as Branch
 from jaxbeam.study.branch import Critical as Critical
 from jaxbeam.study.branch import trace_branch as trace_branch
 from jaxbeam.study.by_hand import euler_bernoulli as euler_bernoulli
+from jaxbeam.study.corrected import Corrected as Corrected
+from jaxbeam.study.corrected import corrected as corrected
 from jaxbeam.study.design import Design as Design
 from jaxbeam.study.design import DesignStatus as DesignStatus
 from jaxbeam.study.design import History as History
@@ -108,6 +110,8 @@ from jaxbeam.study.reach import reach as reach
 from jaxbeam.study.reach import reach_each as reach_each
 from jaxbeam.study.stability import Modes as Modes
 from jaxbeam.study.stability import lowest_mode as lowest_mode
+from jaxbeam.study.two_meshes import TwoMeshes as TwoMeshes
+from jaxbeam.study.two_meshes import two_meshes as two_meshes
 
 __version__ = "0.1.0"
 

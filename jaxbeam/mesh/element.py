@@ -81,6 +81,7 @@ class Element:
     children: np.ndarray
     enriched: Element | None
     shortfall: float
+    spread: float
 
     @property
     def nodes(self) -> int:

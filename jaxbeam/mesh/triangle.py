@@ -109,6 +109,7 @@ QUADRATIC_TRIANGLE = Element(
     children=_FOUR,
     enriched=None,
     shortfall=1.5,
+    spread=0.35,
 )
 TRIANGLE = Element(
     name="triangle",
@@ -123,4 +124,5 @@ TRIANGLE = Element(
     children=_FOUR,
     enriched=QUADRATIC_TRIANGLE,
     shortfall=1.0,
+    spread=0.15,
 )

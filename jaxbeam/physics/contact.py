@@ -209,7 +209,7 @@ class ContactEnergy(Energy):
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
-        params = jax.tree.map(lambda leaf: np.asarray(leaf)[parents], term.params)
+        params = jax.tree.map(lambda leaf: leaf[parents], term.params)
         return Term(self, edges, replace(params, lengths=edge_lengths(mesh.nodes, edges, POINTS)))
 
     def obstacle(self, points: jax.Array, params: ContactParams) -> jax.Array:

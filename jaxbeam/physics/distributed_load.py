@@ -66,7 +66,8 @@ class WeightEnergy(DistributedEnergy):
     name: ClassVar[str] = "weight"
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
-        return weight(mesh, np.repeat(np.asarray(term.params.force), finer.parts, axis=0))
+        force = term.params.force
+        return weight(mesh, namespace(force).repeat(force, finer.parts, axis=0))
 
     def point_loads(self, x: jax.Array, params: DistributedParams) -> jax.Array:
         """The total weight, at the centre of gravity."""
@@ -84,7 +85,7 @@ class TractionEnergy(DistributedEnergy):
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         edges, parents = finer_edges(mesh, term.nodes)
-        return _on_edges(mesh, edges, np.asarray(term.params.force)[parents])
+        return _on_edges(mesh, edges, term.params.force[parents])
 
     def edge_loads(self, x: jax.Array, params: DistributedParams, xi: np.ndarray) -> jax.Array:
         return params.force

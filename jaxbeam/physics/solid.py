@@ -64,7 +64,7 @@ class SolidEnergy(Energy):
         return admissible_step(x, dx, params, keep, bound, RELEASED)
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
-        material = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), finer.parts, axis=0), term.params.material)
+        material = jax.tree.map(lambda leaf: namespace(leaf).repeat(leaf, finer.parts, axis=0), term.params.material)
         degree = element_of(term.nodes).degree_of(term.params.weights.shape[1])
         return solid(mesh, material, self.density, max(degree, element_of(mesh.elements).degree))
 

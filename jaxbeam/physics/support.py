@@ -60,10 +60,12 @@ class SupportEnergy(Energy):
 
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         nodes = heirs(finer, mesh, np.asarray(term.nodes)[:, 0])
-        motion = np.zeros((finer.coarse, len(self.holds)))
-        motion[np.asarray(term.nodes)[:, 0]] = np.asarray(term.params.motion)
-        moved = np.broadcast_to(np.asarray(term.params.moved)[:1], (len(nodes),))
-        return Term(self, nodes[:, None], SupportParams(finer.carry(motion)[nodes].astype(mesh.nodes.dtype), moved))
+        # Row of each coarse node in `motion`; heirs have no share of nodes that are not held.
+        row = np.zeros(finer.coarse, int)
+        row[np.asarray(term.nodes)[:, 0]] = np.arange(len(term.nodes))
+        motion, moved = finer.carry(term.params.motion[row])[nodes], term.params.moved
+        moved = namespace(moved).broadcast_to(moved[:1], (len(nodes),))
+        return Term(self, nodes[:, None], SupportParams(motion.astype(mesh.nodes.dtype), moved))
 
 
 @usual_rules

@@ -323,7 +323,7 @@ def _on_all_cores(
     progress: Callable[[int, int], None] | None,
 ) -> Solution:
     """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
-    parts = _partition(rows, np.arange(len(rows)), size)
+    parts = partition(rows, np.arange(len(rows)), size)
     processes, devices = jax.process_count(), tuple(jax.local_devices())
     # All processes must take part. If there are fewer parts than processes, a process without one solves the first part
     # again.
@@ -373,7 +373,7 @@ def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
     return jax.tree.map(join, *results)
 
 
-def _partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndarray]:
+def partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndarray]:
     """Divide commands into chunks of at most `size` neighbours.
 
     They are sorted along the column that varies most among them and cut near the middle, again and again. Each cut is
@@ -389,4 +389,4 @@ def _partition(rows: np.ndarray, indices: np.ndarray, size: int) -> list[np.ndar
     axis = np.argmax(np.ptp(rows[indices], axis=0))
     ordered = indices[np.argsort(rows[indices, axis], kind="stable")]
     middle = -(-len(indices) // (2 * size)) * size
-    return _partition(rows, ordered[:middle], size) + _partition(rows, ordered[middle:], size)
+    return partition(rows, ordered[:middle], size) + partition(rows, ordered[middle:], size)

@@ -154,13 +154,15 @@ def enriched(scene: Scene) -> tuple[Scene, Finer]:
     The finer mesh can represent every displacement of the coarse one. Triangles of three nodes become triangles of six,
     and triangles of six nodes are cut in four. Nodes keep their numbers, so terms that act on nodes stay as they are.
 
+    Differentiable in the parameters of the terms.
+
     Raises:
         NotRefinable: a `ValueError` that names a term which cannot be refined.
-        ValueError: if the scene is traced or its mesh has no triangles.
+        ValueError: if the mesh or the width of an anchor is traced, or the mesh has no triangles.
     """
     check_scene(scene)
-    if not is_concrete(*jax.tree.leaves(scene)):
-        raise ValueError("scene: expected concrete numbers, got traced ones; a mesh is refined outside jit")
+    if not is_concrete(scene.mesh.nodes):
+        raise ValueError("scene: expected a mesh of known nodes, got traced ones; refine the mesh outside jit")
     elements, count = scene.mesh.elements, scene.mesh.nodes.shape[0]
     if scene.mesh.is_line:
         raise ValueError("scene: expected a mesh of triangles to refine, got a rod, whose error is that of its model")
@@ -187,6 +189,8 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
 
     Without a finer scene, the bar is infinite, and the given scene and positions are returned.
     """
+    if not is_concrete(*jax.tree.leaves(scene)):
+        raise ValueError("scene: expected concrete numbers, got traced ones; inside jit use corrected")
     if (shape := jax.eval_shape(measure, scene, solution.x).shape) != ():
         raise ValueError(f"measure: expected a function that returns a scalar, got shape {shape}")
     own = _change(scene, solution.x, measure, solver)

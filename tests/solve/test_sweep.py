@@ -134,7 +134,7 @@ def test_a_load_too_large_for_one_step_is_applied_in_parts():
 
 def test_partition_is_of_near_ones():
     rows = np.random.default_rng(1).uniform(0.4, 1, (100, 2))
-    parts = module._partition(rows, np.arange(100), 16)
+    parts = module.partition(rows, np.arange(100), 16)
     assert sorted(np.concatenate(parts).tolist()) == list(range(100))
     assert max(len(part) for part in parts) <= 16
     assert np.mean([np.ptp(rows[part], axis=0).max() for part in parts]) < 0.4

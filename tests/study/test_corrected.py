@@ -1,0 +1,131 @@
+"""Measures corrected by a solve on two meshes: values, bars, derivatives, batches and refusals."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+
+CROSSED = partial(jb.tendon_beam, 7, 3, graded=True, diagonals="crossed", anchor_width=0.25)
+CURVED = partial(jb.tendon_beam, 5, 3, order=2, graded=True, anchor_width=0.25)
+
+
+def angle_and_tension(scene: jb.Scene, x: jax.Array) -> jax.Array:
+    return jnp.stack([jb.tip_angle(scene, x), jb.tendon_tensions(scene, x)[0]])
+
+
+@pytest.mark.parametrize("build", [CROSSED, CURVED])
+@pytest.mark.parametrize("ratios", [[0.9, 1.0], [0.5, 0.75]])
+def test_fine_values_are_those_of_an_equilibrium_on_the_finer_mesh(build, ratios):
+    meshes = jb.two_meshes(build())
+    found = jb.corrected(meshes, ratios, angle_and_tension)
+    scene = jb.command(meshes.fine, ratios)
+    exact = jb.check(jb.equilibrium(scene))
+    jb.check(found.solution)
+    assert int(found.steps[1]) <= 4 < int(exact.steps)
+    np.testing.assert_allclose(found.fine, angle_and_tension(scene, exact.x), rtol=2e-5)
+    assert np.all(np.abs(found.fine - angle_and_tension(scene, exact.x)) <= 2 * found.algebraic + 1e-9)
+    # Both meshes err, the finer one less: what the correction adds is the same share of the change for each measure.
+    share = (found.value - found.fine) / (found.fine - found.coarse)
+    np.testing.assert_allclose(share, share[0], atol=1e-9)
+    assert np.isclose(found.solution.energy, jb.energy(scene, found.solution.x), rtol=1e-12)
+
+
+@pytest.mark.parametrize("build", [CROSSED, CURVED])
+def test_derivatives_are_those_of_differences(build):
+    def value(theta):
+        scene = build(young=1e4 * theta[2], tendon_modulus=2e3 * theta[3])
+        return jb.corrected(jb.two_meshes(scene), theta[:2], angle_and_tension).value
+
+    theta = jnp.array([0.7, 0.9, 1.1, 0.9])
+    reverse, forward = jax.jit(jax.jacrev(value))(theta), jax.jit(jax.jacfwd(value))(theta)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
+    h = 1e-3
+    value = jax.jit(value)
+    differences = [
+        (8 * (value(theta + e) - value(theta - e)) - value(theta + 2 * e) + value(theta - 2 * e)) / (12 * h)
+        for e in h * np.eye(4)
+    ]
+    np.testing.assert_allclose(reverse, np.stack(differences, axis=1), rtol=2e-4)
+
+
+def test_many_commands_are_each_like_one():
+    meshes = jb.two_meshes(CROSSED())
+    # A line of neighbours, and some far from each other.
+    line = np.linspace([0.8, 1.0], [0.7, 0.95], 14)
+    rows = np.concatenate([line, np.random.default_rng(2).uniform(0.5, 1.1, (6, 2))])
+    many = jb.corrected(meshes, rows, angle_and_tension)
+    jb.check(many.solution)
+    for k in (0, 7, 19):
+        one = jb.corrected(meshes, rows[k], angle_and_tension)
+        np.testing.assert_allclose(many.value[k], one.value, rtol=1e-4)
+        np.testing.assert_allclose(many.bar[k], one.bar, rtol=0.1)
+
+
+def test_many_commands_inside_jit():
+    meshes = jb.two_meshes(CROSSED())
+    rows = np.array([[0.9, 1.0], [0.7, 0.8]])
+    loss = lambda rows: jnp.sum(jb.corrected(meshes, rows, jb.tip_angle).value)
+    slopes = jax.jit(jax.grad(loss))(rows)
+    single = jax.grad(lambda row: jb.corrected(meshes, row, jb.tip_angle).value)(jnp.asarray(rows[1]))
+    np.testing.assert_allclose(slopes[1], single, rtol=1e-9)
+    mapped = jax.vmap(lambda row: jb.corrected(meshes, row, jb.tip_angle).value)(jnp.asarray(rows))
+    assert np.isclose(jnp.sum(mapped), loss(rows), rtol=1e-5)
+
+
+def test_a_failed_solve_has_no_bar_and_spoils_no_other():
+    meshes = jb.two_meshes(CROSSED())
+    found = jb.corrected(meshes, [[0.9, 1.0], [0.02, 0.02]], jb.tip_angle, jb.Newton(max_steps=12))
+    assert found.solution.status[0] == 0 and np.isfinite(found.bar[0])
+    assert found.solution.status[1] & jb.Status.NOT_CONVERGED and np.isinf(found.bar[1])
+    loss = lambda rows: jb.corrected(meshes, rows, jb.tip_angle, jb.Newton(max_steps=12)).value
+    slope = jax.grad(lambda rows: loss(rows)[0])(jnp.array([[0.9, 1.0], [0.02, 0.02]]))
+    assert np.all(np.isfinite(slope[0])) and np.all(slope[1] == 0)
+
+
+def test_point_anchors_have_no_bar():
+    meshes = jb.two_meshes(jb.tendon_beam(7, 3))
+    assert "single node" in meshes.doubt
+    found = jb.corrected(meshes, [0.9, 1.0], jb.tip_angle)
+    assert np.isinf(found.bar) and found.solution.status == 0
+
+
+def test_float32():
+    meshes = jb.two_meshes(CROSSED(dtype=jnp.float32))
+    found = jb.corrected(meshes, [0.6, 1.0], jb.tip_angle)
+    jb.check(found.solution)
+    assert found.value.dtype == found.bar.dtype == jnp.float32
+    exact = jb.corrected(jb.two_meshes(CROSSED()), [0.6, 1.0], jb.tip_angle)
+    assert np.isclose(found.value, exact.value, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((jb.tendon_beam(5, 3), [1.0, 1.0], jb.tip_angle), "meshes: .*two_meshes"),
+        ((None, [1.0], jb.tip_angle), "2"),
+        ((None, [[-0.5, 1.0]], jb.tip_angle), "ratios"),
+        ((None, np.ones((2, 2, 2)), jb.tip_angle), "ratios: expected shape"),
+        ((None, [1.0, 1.0], 3), "measure"),
+    ],
+)
+def test_refusals(arguments, words):
+    meshes, *rest = arguments
+    with pytest.raises(ValueError, match=words):
+        jb.corrected(meshes if meshes is not None else jb.two_meshes(CROSSED()), *rest)
+
+
+def test_a_rod_has_no_finer_mesh():
+    with pytest.raises(ValueError, match="rod"):
+        jb.two_meshes(jb.rod_beam())
+
+
+def test_traced_nodes_are_refused():
+    scene = CROSSED()
+    with pytest.raises(ValueError, match="known nodes"):
+        jax.eval_shape(jb.two_meshes, scene)
