@@ -14,7 +14,7 @@ from jaxbeam.core.tree import Numbers, is_concrete, namespace
 from jaxbeam.mesh.bodies import Shape, mapped
 from jaxbeam.mesh.line import straight
 from jaxbeam.mesh.mesh import with_middles
-from jaxbeam.mesh.rectangle import Diagonals, middle_column, rectangle
+from jaxbeam.mesh.rectangle import Diagonals, Grading, middle_column, rectangle
 from jaxbeam.physics.materials import lame, macklin_mueller
 from jaxbeam.physics.rod import rod
 from jaxbeam.physics.rod_tendon import rod_tendons
@@ -36,7 +36,7 @@ def tendon_beam(
     order: int = 1,
     degree: int | None = None,
     anchor_width: float = 0.0,
-    graded: bool = False,
+    graded: Grading = False,
     diagonals: Diagonals = "one-sided",
     density: Callable[[jax.Array, Any], jax.Array] = macklin_mueller,
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
@@ -62,7 +62,8 @@ def tendon_beam(
             they pull on single nodes, and the answer drifts as the mesh is refined: with the top tendon at ratio 0.8,
             six-node triangles on 15 x 5, 29 x 7 and 57 x 13 corners give 9.77, 9.68 and 9.46 degrees. With a width of
             0.25 they give 10.14 on each.
-        graded: crowd nodes at the clamp, the faces and the middle, where the tendons end; see `rectangle`.
+        graded: True or "proportional" to crowd nodes at the clamp, the faces and the middle, where the tendons end; see
+            `rectangle`. The second converges faster.
         diagonals: see `rectangle`.
         density: the material, see `jaxbeam.physics.materials`.
         stiffness: the law of the tendons, see `tendons`.

@@ -7,6 +7,7 @@ import pytest
 from helpers import EPS, areas, disturbed, l_shape, shuffled, total_area
 
 import jaxbeam as jb
+from jaxbeam.mesh.rectangle import middle_column
 
 PATTERNS = ["one-sided", "mirrored", "crossed"]
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -143,6 +144,9 @@ def test_refuses(nodes, elements, message):
         ({"height": [1.0, 2.0]}, r"height: expected a positive finite number, got \[1\.0, 2\.0\]"),
         ({"diagonals": "alternate"}, r"diagonals: expected 'one-sided', 'mirrored' or 'crossed', got 'alternate'"),
         ({"nx": 2, "graded": True}, r"nx: expected at least 3 for a graded mesh, got 2: no node .*; use 3"),
+        ({"nx": 2, "graded": "proportional"}, r"nx: expected at least 3 for a graded mesh, got 2: no node .*; use 3"),
+        ({"graded": "linear"}, r"graded: expected True or False, got 'linear'; the third choice is 'proportional'"),
+        ({"graded": 1}, r"graded: expected True or False, got 1; the third choice is 'proportional'"),
         ({"diagonals": "mirrored", "ny": 4}, r"ny: expected an odd number for mirrored diagonals, got 4.*use 5"),
     ],
 )
@@ -162,6 +166,58 @@ def test_graded_columns_crowd_at_the_edge_and_in_the_middle(nx):
     for half in (columns[: middle + 1], columns[middle:]):
         assert (np.diff(np.diff(half)) > 0).all()
     assert rows[1] - rows[0] < rows[2] - rows[1]
+
+
+def counted(density, places):
+    """The integral of a density between places that follow each other, by Gauss's rule."""
+    at, weights = np.polynomial.legendre.leggauss(40)
+    middles, halves = (places[1:] + places[:-1]) / 2, np.diff(places) / 2
+    return halves * (density(middles[:, None] + halves[:, None] * at) @ weights)
+
+
+@pytest.mark.parametrize("nx", [3, 4, 9, 30])
+@pytest.mark.parametrize(("length", "height"), [(2.0, 2.0), (3.5, 0.8), (8000.0, 800.0)])
+def test_proportional_cells_have_their_density(nx, length, height):
+    """Between two neighbours lies the same share of the density, as the docstring of `rectangle` gives it."""
+    mesh = jb.rectangle(length, height, nx, 6, graded="proportional")
+    columns, rows = np.unique(mesh.nodes[:, 0]), np.unique(mesh.nodes[:, 1])
+    assert len(columns) == nx and len(rows) == 6
+    np.testing.assert_array_equal(columns[[0, -1]], [-length / 2, length / 2])
+    middle = int(np.flatnonzero(columns == 0)[0])
+    assert middle == middle_column(nx, "proportional")
+    clamp, anchor, face = (share * height for share in (0.03, 0.2, 0.06))
+    left = lambda x: 1 / (x + length / 2 + clamp) + 1 / (anchor - x)
+    across = lambda y: 1 / (y + height / 2 + face) + 1 / (height / 2 + face - y)
+    for density, places in (
+        (left, columns[: middle + 1]),
+        (lambda x: 1 / (x + anchor), columns[middle:]),
+        (across, rows),
+    ):
+        shares = counted(density, places)
+        np.testing.assert_allclose(shares, shares.mean(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("diagonals", ["mirrored", "crossed"])
+def test_proportional_rows_are_symmetric(diagonals):
+    """To the last bit, so that a beam whose tendons are pulled alike does not choose a side."""
+    mesh = jb.rectangle(3.5, 0.8, 5, 7, diagonals, graded="proportional", order=2)
+    nodes = {tuple(node) for node in mesh.nodes.tolist()}
+    assert {(x, -y) for x, y in nodes} == nodes
+
+
+def test_proportional_mesh_is_differentiable_in_its_extents():
+    place = lambda extents: jb.rectangle(*extents, 6, 4, "crossed", graded="proportional", order=2).nodes
+    extents = jnp.array([3.5, 0.8])
+    np.testing.assert_allclose(
+        jax.jit(place)(extents),
+        jb.rectangle(3.5, 0.8, 6, 4, "crossed", graded="proportional", order=2).nodes,
+        rtol=1e-12,
+        atol=1e-14,
+    )
+    slopes = jax.jacfwd(place)(extents)
+    for k, step in enumerate(np.eye(2) * 1e-5):
+        np.testing.assert_allclose(slopes[..., k], (place(extents + step) - place(extents - step)) / 2e-5, atol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(place)(extents), slopes, atol=1e-12)
 
 
 def test_traced_topology_is_refused():

@@ -204,9 +204,10 @@ def test_clamped_refuses(nodes, message):
         jb.clamped(UNIT, nodes)
 
 
+@pytest.mark.parametrize("graded", [True, "proportional"])
 @pytest.mark.parametrize("nx", [3, 8, 11])
-def test_tendons_of_a_graded_beam_end_in_the_middle(nx):
-    scene = jb.tendon_beam(nx, 5, graded=True)
+def test_tendons_of_a_graded_beam_end_in_the_middle(nx, graded):
+    scene = jb.tendon_beam(nx, 5, graded=graded)
     ends = np.asarray(scene.mesh.nodes)[scene.terms[1].nodes]
     np.testing.assert_allclose(ends, [[[-1.75, 0.4], [0, 0.4]], [[-1.75, -0.4], [0, -0.4]]], atol=1e-15)
 
