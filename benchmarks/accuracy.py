@@ -1,20 +1,28 @@
 """Error against time: every model, order, mesh, anchor, precision and tolerance, and what to choose.
 
-    python -m benchmarks.accuracy [--quick] [--poisson 0.45 ...] [--crease]
+    python -m benchmarks.accuracy [--quick] [--conditions | --crease]
 
-The reference beam with anchors of width 0.25, its top tendon pulled to ratios from 0.95 to 0.5, at Poisson's ratios
-from 0.3 to 0.4999. Errors of the tip angle and of the tendon's tension, in percent of a solution on a graded mesh of
-crossed six-node triangles (57 x 13 corners), whose own error is estimated from one of half the fineness. The larger of
-the two counts. Times are of one call after compiling, medians, each beside one jump of the reference scene (P1 29 x 7,
-point anchors, Poisson's ratio 0.45) to the same ratio in turn with it; at 0.4999 settings are ramped to the command,
-which a jump reaches in a hundred steps.
-
-For each Poisson's ratio it ends with the table a user chooses from: the cheapest setting for 10, 1, 0.1 and 0.01 % of
+The reference beam with anchors of width 0.25, its top tendon pulled to ratios from 0.95 to 0.5 in steps of 0.005.
+Errors of the tip angle and of the tendon's tension, in percent of the truth; the larger of the two counts. Times are of
+one call after compiling, medians, each beside one jump of the reference scene (P1 29 x 7, point anchors) to the same
+ratio in turn with it. It ends with the table a user chooses from: the cheapest setting for 10, 1, 0.1 and 0.01 % of
 error over all ratios.
 
-Below a ratio of about 0.4, and of about 0.5 at a Poisson's ratio of 0.3, the surface under a tendon creases on fine
-meshes, a true instability of the material: no answer there is independent of the mesh, and none is compared. `--crease`
-shows it: the tension jumps as the ratio falls.
+The truth is extrapolated from three meshes of six-node triangles with proportional spacing, whose cells are finer by
+4/3 each. Two errors fall at different rates: that of the singular corner of the clamp, with the power `2 lambda` of the
+size of a cell, and the rest, with about its cube. `lambda` is the exponent of a corner between a clamped and a free
+side (Williams, J. Appl. Mech. 19, 1952, 526-528), in plane strain
+
+    sin^2(lambda pi / 2) (3 - 4 nu) = 4 (1 - nu)^2 - lambda^2.
+
+Its own error is estimated by the extrapolation from the two finer meshes, with the corner's term only.
+
+`--conditions` tells the errors elsewhere: with both tendons pulled, other proportions, Poisson's ratios, tendons and
+anchors. Each is the largest over the ratios 0.95, 0.8, 0.65 and 0.5.
+
+Below a ratio of about 0.4, and of about 0.5 on stubby beams or at a Poisson's ratio of 0.3, the surface under a tendon
+creases on fine meshes, a true instability of the material: no answer there is independent of the mesh, and none is
+compared. `--crease` shows it: the tension jumps as the ratio falls.
 """
 
 from __future__ import annotations
@@ -33,190 +41,251 @@ import jaxbeam as jb
 from benchmarks import report
 from benchmarks.timing import in_turn
 
-RATIOS = (0.95, 0.8, 0.6, 0.5)
-POISSONS = (0.3, 0.45, 0.49, 0.499, 0.4999)
+# Ratios of the top tendon: those of the table, and a few of them, at which times are taken.
+FINE = np.linspace(0.95, 0.5, 91)
+FEW = FINE[::30]
 WIDTH = 0.25
-FINEST = {"nx": 57, "ny": 13, "order": 2, "graded": True, "diagonals": "crossed"}
-HALF = FINEST | {"nx": 29, "ny": 7}
-# Share of it by which a measure differs between two fine meshes where one has creased and the other not.
-CREASED = 0.05
+# Cells of the meshes of the truth, along the length and across the height; the finest is `FINEST`.
+TRUTH = ((27, 18), (36, 24), (48, 32))
+# Share of a measure by which two extrapolations differ where a mesh has creased.
+CREASED = 0.005
 GOALS = (10.0, 1.0, 0.1, 0.01)
+FINEST = {"nx": 49, "ny": 33, "order": 2, "graded": "proportional", "diagonals": "mirrored"}
+# Six-node meshes with proportional spacing, by nodes of triangles along the length and across the height.
+MIRRORED = ((9, 5), (11, 5), (13, 5), (15, 7), (17, 9), (21, 9), (25, 13), (33, 17), (41, 21))
+CROSSED = ((9, 4), (11, 4), (13, 5), (17, 6), (21, 7), (25, 9), (33, 12))
+# Three-node crossed ones.
+THREE = ((21, 5), (29, 7), (41, 11), (57, 15))
+# Settings whose errors are told elsewhere.
+ELSEWHERE = (
+    "by hand",
+    "rod, 9 nodes",
+    "P1 29 x 7 one-sided point anchors",
+    "P2 9 x 5 one-sided graded",
+    "P2 11 x 5 mirrored proportional",
+    "P2 17 x 9 mirrored proportional",
+)
+
+
+class Condition(NamedTuple):
+    """What is solved: arguments of `tendon_beam`, and the share of the top tendon's pull that the bottom one has."""
+
+    name: str
+    given: dict[str, Any]
+    share: float = 0.0
+
+    def commands(self, ratios: np.ndarray) -> np.ndarray:
+        return np.stack([ratios, 1 - self.share * (1 - ratios)], axis=1)
+
+
+REFERENCE = Condition("reference", {})
+CONDITIONS = (
+    REFERENCE,
+    Condition("both, (r, (1 + r) / 2)", {}, 0.5),
+    Condition("both, nearly alike", {}, 0.9),
+    *(Condition(f"length / height {k}", {"length": 0.8 * k}) for k in (2, 3, 6, 10)),
+    *(Condition(f"Poisson's ratio {nu}", {"poisson": nu}) for nu in (0.3, 0.49, 0.499)),
+    Condition("tendons 5 times as stiff", {"tendon_modulus": 1e4}),
+    *(Condition(f"anchors of width {width}", {"anchor_width": width}) for width in (0.125, 0.5)),
+)
+
+
+class Ready(NamedTuple):
+    """A setting under a condition: `solve(command)`, and `measure(command, found)`: tip angle and tensions."""
+
+    solve: Callable[[np.ndarray], Any]
+    measure: Callable[[np.ndarray, Any], np.ndarray]
 
 
 class Setting(NamedTuple):
-    """A way to solve: `scene(poisson)` at rest and `solve(scene, ratios) -> x`."""
+    """A way to solve: `ready(given)` for the arguments of a condition."""
 
     name: str
-    scene: Callable[[float], jb.Scene]
-    solve: Callable[[jb.Scene, list[float]], Any]
+    ready: Callable[[dict[str, Any]], Ready]
 
 
-def beam(poisson: float, **kwargs: Any) -> jb.Scene:
-    """The reference beam with wide anchors, unless said otherwise."""
-    return jb.tendon_beam(poisson=poisson, **({"anchor_width": WIDTH} | kwargs))
+def beam(given: dict[str, Any], solver: jb.Newton = jb.Newton(), steps: int = 0, **mesh: Any) -> Ready:
+    """A beam of triangles, solved by one jump, or by a ramp of so many steps."""
+    scene = jb.tendon_beam(**({"anchor_width": WIDTH} | given | mesh))
+    return Ready(partial(solved, scene, solver, steps), partial(measured, scene))
 
 
-def solved(scene: jb.Scene, ratios: list[float], solver: jb.Newton = jb.Newton(), steps: int = 0) -> jb.Solution:
-    """By one jump, or by a ramp of so many steps."""
+def rod(given: dict[str, Any], nodes: int) -> Ready:
+    """The rod in the place of the solid, whose anchors have no width."""
+    scene = jb.rod_beam(nodes, **{name: value for name, value in given.items() if name != "anchor_width"})
+    return Ready(partial(solved, scene, jb.Newton(), 0), partial(measured, scene))
+
+
+def linear(given: dict[str, Any], **mesh: Any) -> Ready:
+    """Linear elasticity."""
+    scene = jb.tendon_beam(**({"anchor_width": WIDTH} | given | mesh))
+    return Ready(lambda command: jb.linear_response(jb.command(scene, command)), partial(measured, scene))
+
+
+def hand(given: dict[str, Any]) -> Ready:
+    """The hand calculation."""
+    given = {name: value for name, value in given.items() if name != "anchor_width"}
+    told = lambda command, found: np.array([found.tip_angle, *found.tensions], float)
+    return Ready(lambda command: jb.euler_bernoulli(command, **given), told)
+
+
+def solved(scene: jb.Scene, solver: jb.Newton, steps: int, command: np.ndarray) -> jb.Solution:
+    """By one jump, or the end of a ramp of so many steps."""
     if steps:
-        return jax.tree.map(lambda leaf: leaf[-1], jb.ramp(scene, ratios, steps=steps, solver=solver))
-    return jb.equilibrium(jb.command(scene, ratios), solver=solver)
+        return jax.tree.map(lambda leaf: leaf[-1], jb.ramp(scene, command, steps=steps, solver=solver))
+    return jb.equilibrium(jb.command(scene, command), solver=solver)
+
+
+def measured(scene: jb.Scene, command: np.ndarray, found: Any) -> np.ndarray:
+    """Tip angle and the tensions of both tendons `(3,)`; NaN if the solution is not OK."""
+    if isinstance(found, jb.Solution):
+        if found.status != 0:
+            return np.full(3, np.nan)
+        found = found.x
+    scene = jb.command(scene, command)
+    return np.array([jb.tip_angle(scene, found), *jb.tendon_tensions(scene, found)], float)
 
 
 def settings(quick: bool) -> list[Setting]:
     """All settings, from cheap to dear."""
-    found = [Setting("linear, P2 9 x 5 graded", partial(beam, nx=9, ny=5, order=2, graded=True), linear)]
-    for nodes in (9, 17):
-        found.append(Setting(f"rod, {nodes} nodes", partial(rod, nodes=nodes), solved))
+    found = [
+        Setting("by hand", hand),
+        Setting("linear, P2 9 x 5 graded", partial(linear, nx=9, ny=5, order=2, graded=True)),
+        *(Setting(f"rod, {nodes} nodes", partial(rod, nodes=nodes)) for nodes in (9, 17)),
+    ]
+    six, near = {"order": 2}, {"order": 2, "graded": "proportional"}
+    mirrored, crossed = {"diagonals": "mirrored"}, {"diagonals": "crossed"}
     meshes: list[dict[str, Any]] = [
-        {"nx": 15, "ny": 4},
         {"nx": 29, "ny": 7, "anchor_width": 0.0},
         {"nx": 29, "ny": 7},
         {"nx": 57, "ny": 13},
-        {"nx": 15, "ny": 5, "diagonals": "crossed"},
-        {"nx": 29, "ny": 7, "diagonals": "crossed"},
-        {"nx": 29, "ny": 7, "diagonals": "mirrored"},
-        {"nx": 29, "ny": 7, "graded": True},
-        {"nx": 7, "ny": 3, "order": 2},
-        {"nx": 15, "ny": 5, "order": 2},
-        {"nx": 29, "ny": 7, "order": 2},
-        {"nx": 7, "ny": 3, "order": 2, "graded": True},
-        {"nx": 9, "ny": 4, "order": 2, "graded": True},
-        {"nx": 9, "ny": 5, "order": 2, "graded": True},
-        {"nx": 11, "ny": 5, "order": 2, "graded": True},
-        {"nx": 15, "ny": 5, "order": 2, "graded": True},
-        {"nx": 15, "ny": 5, "order": 2, "graded": True, "degree": 4},
-        {"nx": 21, "ny": 7, "order": 2, "graded": True},
-        {"nx": 29, "ny": 9, "order": 2, "graded": True},
-        {"nx": 9, "ny": 4, "order": 2, "graded": True, "diagonals": "crossed"},
-        {"nx": 15, "ny": 5, "order": 2, "graded": True, "diagonals": "crossed"},
-        {"nx": 17, "ny": 6, "order": 2, "graded": True, "diagonals": "crossed"},
-        HALF,
+        {"nx": 29, "ny": 7} | crossed,
+        {"nx": 15, "ny": 5} | six,
+        {"nx": 29, "ny": 7} | six,
+        {"nx": 9, "ny": 5, "graded": True} | six,
+        {"nx": 17, "ny": 6, "graded": True} | six | crossed,
+        {"nx": 29, "ny": 9, "graded": True} | six,
+        *({"nx": nx, "ny": ny} | near | mirrored for nx, ny in MIRRORED),
+        *({"nx": nx, "ny": ny} | near | crossed for nx, ny in CROSSED),
+        *({"nx": nx, "ny": ny} | near | crossed | {"order": 1} for nx, ny in THREE),
     ]
     for mesh in meshes[::3] if quick else meshes:
-        found.append(Setting(label(mesh), partial(beam, **mesh), solved))
+        found.append(Setting(label(mesh), partial(beam, **mesh)))
     base = {"nx": 9, "ny": 5, "order": 2, "graded": True}
-    for name, extra, solve in (
-        ("float32", {"dtype": jnp.float32}, solved),
-        ("float32, residual 1e-3", {"dtype": jnp.float32}, partial(solved, solver=jb.Newton(rtol=1e-3))),
-        ("float32, residual 1e-2", {"dtype": jnp.float32}, partial(solved, solver=jb.Newton(rtol=1e-2))),
-        ("residual 1e-3", {}, partial(solved, solver=jb.Newton(rtol=1e-3))),
-        ("residual 1e-4", {}, partial(solved, solver=jb.Newton(rtol=1e-4))),
-        ("residual 1e-7", {}, partial(solved, solver=jb.Newton(rtol=1e-7))),
-        ("ramp of 4", {}, partial(solved, steps=4)),
-        ("ramp of 10", {}, partial(solved, steps=10)),
+    for name, extra in (
+        ("float32", {"dtype": jnp.float32}),
+        ("float32, residual 1e-2", {"dtype": jnp.float32, "solver": jb.Newton(rtol=1e-2)}),
+        ("residual 1e-4", {"solver": jb.Newton(rtol=1e-4)}),
+        ("ramp of 10", {"steps": 10}),
     ):
-        found.append(Setting(f"{label(base)}, {name}", partial(beam, **base, **extra), solve))
+        found.append(Setting(f"{label(base)}, {name}", partial(beam, **base, **extra)))
     return found
 
 
 def label(mesh: dict[str, Any]) -> str:
     """The name of a mesh."""
-    words = [f"P{mesh.get('order', 1)} {mesh['nx']} x {mesh['ny']}", mesh.get("diagonals", "")]
-    words += ["graded" if mesh.get("graded") else "", f"degree {mesh['degree']}" if "degree" in mesh else ""]
+    words = [f"P{mesh.get('order', 1)} {mesh['nx']} x {mesh['ny']}", mesh.get("diagonals", "one-sided")]
+    words += [{True: "graded", "proportional": "proportional"}.get(mesh.get("graded", False), "")]
     words += ["point anchors" if mesh.get("anchor_width") == 0 else ""]
     return " ".join(word for word in words if word)
 
 
-def rod(poisson: float, nodes: int) -> jb.Scene:
-    """The rod in the place of the solid."""
-    return jb.rod_beam(nodes, poisson=poisson)
+def singularity(poisson: float) -> float:
+    """The exponent `lambda` of the corner of the clamp, see the head of this module."""
+    excess = lambda power: np.sin(power * np.pi / 2) ** 2 * (3 - 4 * poisson) + power**2 - 4 * (1 - poisson) ** 2
+    low, high = 0.5, 1.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+    return low
 
 
-def linear(scene: jb.Scene, ratios: list[float]) -> Any:
-    """The answer of linear elasticity."""
-    return jb.linear_response(jb.command(scene, ratios))
+def truth(condition: Condition, ratios: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
+    """Tip angle and tensions `(ratios, 3)`, NaN where the surface creases, and their own error in percent.
 
-
-def measured(scene: jb.Scene, ratios: list[float], x: Any) -> np.ndarray:
-    """Tip angle, and the tension and length of the top tendon."""
-    scene = jb.command(scene, ratios)
-    tension, length = jb.tendon_tensions(scene, x)[0], jb.tendon_lengths(scene, x)[0]
-    return np.array([jb.tip_angle(scene, x), tension, length], float)
-
-
-def references(poisson: float) -> tuple[np.ndarray, np.ndarray]:
-    """Measures `(ratios, 3)` on the finest mesh, and their distance from those on one half as fine; NaN where these are
-    so far apart that there is no answer to tell an error from: one mesh has creased."""
+    Args:
+        condition: what is solved.
+        ratios: of the top tendon, among those of the ramp.
+        steps: of a ramp from rest to the last ratio.
+    """
+    rows = np.round((1 - ratios) / (1 - ratios[-1]) * (steps - 1)).astype(int)
     answers = []
-    for mesh in (FINEST, HALF):
-        scene, rows = beam(poisson, **mesh), []
-        for ratio in RATIOS:
-            found = jb.check(solved(scene, [ratio, 1.0], steps=9))
-            rows.append(measured(scene, [ratio, 1.0], found.x))
-        answers.append(np.array(rows))
-    truth, gap = answers[0], answers[0] - answers[1]
-    creased = np.any(np.abs(gap) > CREASED * np.abs(truth), axis=1, keepdims=True)
-    return np.where(creased, np.nan, truth), np.where(creased, np.nan, gap)
+    for columns, across in TRUTH:
+        mesh = FINEST | {"nx": columns + 1, "ny": across + 1}
+        scene = jb.tendon_beam(**({"anchor_width": WIDTH} | condition.given | mesh))
+        path = jb.ramp(scene, condition.commands(ratios)[-1], steps=steps)
+        states = (jax.tree.map(lambda leaf, row=row: leaf[row], path) for row in rows)
+        answers.append([measured(scene, state.ratios, state) for state in states])
+    material = jb.lame(1.0, condition.given.get("poisson", 0.45))
+    # Macklin-Mueller's material has the first Lame parameter lam - mu at small strain.
+    rate = 2 * singularity(float((material.lam - material.mu) / (2 * material.lam)))
+    cells = np.array([columns for columns, _ in TRUTH], float)
+    both = np.linalg.inv(np.stack([cells**0, cells**-rate, cells**-3.0], axis=1))[0]
+    corner = np.append(0.0, np.linalg.inv(np.stack([cells[1:] ** 0, cells[1:] ** -rate], axis=1))[0])
+    exact, other = (np.tensordot(weights, np.array(answers), axes=1) for weights in (both, corner))
+    gap = np.abs(other / exact - 1)[:, :2].max(axis=1)
+    exact[~(gap < CREASED)] = np.nan
+    return exact, 100 * float(gap[gap < CREASED].max(initial=0))
 
 
-def timed(run: Callable[[], Any], ratio: float, repeats: int) -> dict[str, float]:
-    """Milliseconds of a solve, and those over the time that one jump of the reference scene takes in turn with it."""
-    own, other = in_turn(run, partial(solved, jb.tendon_beam(), [ratio, 1.0]), repeats=repeats)
-    return {"ms": 1e3 * own.median, "over": own.over(other)}
+def errors(ready: Ready, commands: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Percent by which tip angle and tensions are off at each command, `(ratios, 3)`; infinite where the solve failed.
+
+    A tension that the truth has not, that of the slack tendon, is compared like the others.
+    """
+    found = np.array([ready.measure(command, ready.solve(command)) for command in commands])
+    off = 100 * (found / exact - 1)
+    return np.where(np.isnan(found) & ~np.isnan(exact), np.inf, off)
 
 
-def errors(setting: Setting, poisson: float, truth: np.ndarray, repeats: int) -> list[dict[str, Any]]:
-    """Percent of error and time of a setting at every ratio."""
-    scene, rows = setting.scene(poisson), []
-    steep = poisson > 0.495
-    solve = partial(solved, steps=9) if setting.solve is solved and steep else setting.solve
-    for ratio, exact in zip(RATIOS, truth, strict=True):
-        command = [ratio, 1.0]
-        found = solve(scene, command)
-        x, status = (found.x, int(found.status)) if isinstance(found, jb.Solution) else (found, 0)
-        off = 100 * (measured(scene, command, x) / exact - 1)
-        row = {"setting": setting.name, "poisson": poisson, "ratio": ratio, "status": status}
-        row |= timed(partial(solve, scene, command), ratio, repeats)
-        rows.append(row | {"angle": off[0], "tension": off[1], "length": off[2]})
-    return rows
+def worst(off: np.ndarray) -> float:
+    """The largest error of the angle and of the top tendon's tension."""
+    return float(np.nanmax(np.abs(off[:, :2]), initial=0))
 
 
-def hand(poisson: float, truth: np.ndarray, repeats: int) -> list[dict[str, Any]]:
-    """The hand calculation."""
-    rows = []
-    for ratio, exact in zip(RATIOS, truth, strict=True):
-        calculate = partial(jb.euler_bernoulli, [ratio, 1.0], poisson=poisson)
-        found = calculate()
-        off = 100 * (np.array([found.tip_angle, found.tensions[0], found.lengths[0]]) / exact - 1)
-        row = {"setting": "by hand", "poisson": poisson, "ratio": ratio, "status": 0} | timed(calculate, ratio, repeats)
-        rows.append(row | {"angle": off[0], "tension": off[1], "length": off[2]})
-    return rows
+def timed(ready: Ready, repeats: int) -> tuple[float, float]:
+    """Milliseconds at 0.8, and the mean over a few ratios of the time over that of one jump of the reference scene."""
+    plain, ms, over = beam({"anchor_width": 0.0}), 0.0, []
+    for command in REFERENCE.commands(FEW):
+        own, other = in_turn(partial(ready.solve, command), partial(plain.solve, command), repeats=repeats)
+        ms = own.median * 1e3 if command[0] == FEW[1] else ms
+        over.append(own.over(other))
+    return ms, float(np.mean(over))
 
 
-def print_rows(rows: list[dict[str, Any]], poisson: float) -> None:
-    """Errors of the angle and tension at each ratio, a line for each setting."""
-    percents = (f"{ratio} {measure} %" for measure in ("angle", "tension") for ratio in RATIOS)
-    header = (f"nu = {poisson}", *percents, "ms at 0.8", "over reference")
-    names = list(dict.fromkeys(row["setting"] for row in rows))
+def compare(quick: bool) -> None:
+    """Error and time of every setting, and the cheapest for each goal."""
+    exact, own = truth(REFERENCE, FINE, 101)
+    print(f"angle, tensions at {FEW}:\n{np.round(exact[::30], 5)}\nown error of the truth: {own:.4f} %\n")
     lines = []
-    for name in names:
-        own = [row for row in rows if row["setting"] == name]
-        show = lambda value, row: "-" if row["status"] or np.isnan(value) else f"{value:+.3f}"
-        angles, tensions = ([show(row[key], row) for row in own] for key in ("angle", "tension"))
-        times = own[RATIOS.index(0.8)]["ms"], float(np.mean([row["over"] for row in own]))
-        lines.append((name, *angles, *tensions, *times))
-    report.table(header, lines)
-
-
-def worst(rows: list[dict[str, Any]]) -> list[tuple[str, float, float]]:
-    """Of each setting: over all ratios its largest error, of angle or tension, and its mean time."""
-    found = []
-    for name in dict.fromkeys(row["setting"] for row in rows):
-        own = [row for row in rows if row["setting"] == name]
-        if not any(row["status"] for row in own):
-            error = float(np.nanmax([[abs(row["angle"]), abs(row["tension"])] for row in own]))
-            found.append((name, error, float(np.mean([row["over"] for row in own]))))
-    return found
-
-
-def choose(rows: list[dict[str, Any]], floor: float) -> list[tuple[Any, ...]]:
-    """The cheapest setting for each goal; the reference's own error is added to each."""
-    lines = []
+    for setting in settings(quick):
+        ready = setting.ready({})
+        off = errors(ready, REFERENCE.commands(FINE), exact)
+        at = FINE[np.nanargmax(np.abs(off[:, :2]).max(axis=1))]
+        shown = [f"{value:+.3f}" for value in off[::30, :2].T.ravel()]
+        lines.append((setting.name, *shown, worst(off), f"{at:.3f}", *timed(ready, 3 if quick else 9)))
+    names = (f"{name} % at {ratio:g}" for name in ("angle", "tension") for ratio in FEW)
+    report.table(("setting", *names, "worst %", "at", "ms at 0.8", "over reference"), lines)
+    print("The cheapest setting for an error of angle and tension, over all ratios; the truth's own error is added:\n")
+    chosen = []
     for goal in GOALS:
-        fit = [entry for entry in worst(rows) if entry[1] + floor <= goal]
-        lines.append((f"{goal} %", *(min(fit, key=lambda entry: entry[2]) if fit else ("none here", None, None))))
-    return lines
+        fit = [(line[0], line[-4], line[-1]) for line in lines if line[-4] + own <= goal]
+        chosen.append((f"{goal} %", *(min(fit, key=lambda entry: entry[2]) if fit else ("none here", None, None))))
+    report.table(("error", "setting", "error %", "over reference"), chosen)
+
+
+def elsewhere() -> None:
+    """The largest errors over a few ratios, under every condition: of angle and of the tension of the top tendon."""
+    chosen = [s for s in settings(False) if s.name in ELSEWHERE]
+    lines = []
+    for condition in CONDITIONS:
+        exact, own = truth(condition, FEW, 11)
+        kept, line = int((~np.isnan(exact[:, 0])).sum()), []
+        for setting in chosen:
+            off = errors(setting.ready(condition.given), condition.commands(FEW), exact)[:kept]
+            line.append("/".join(f"{value:.2f}" for value in np.abs(off[:, :2]).max(axis=0)))
+        lines.append((condition.name, f"{FEW[kept - 1]:g}", *line, own))
+    report.table(("largest error of angle/tension, %", "down to", *(s.name for s in chosen), "of the truth"), lines)
 
 
 def crease() -> None:
@@ -224,38 +293,29 @@ def crease() -> None:
     ratios = np.linspace(1, 0.36, 65)
     rows = []
     for mesh in ({"nx": 29, "ny": 7}, {"nx": 113, "ny": 25, "order": 2}):
-        path = jb.ramp(beam(0.45, **mesh), [ratios[-1], 1.0], steps=len(ratios))
-        tensions = jax.vmap(lambda r, x, mesh=mesh: jb.tendon_tensions(jb.command(beam(0.45, **mesh), r), x)[0])
+        scene = jb.tendon_beam(anchor_width=WIDTH, **mesh)
+        path = jb.ramp(scene, [ratios[-1], 1.0], steps=len(ratios))
+        tensions = jax.vmap(lambda r, x, scene=scene: jb.tendon_tensions(jb.command(scene, r), x)[0])
         values = np.asarray(tensions(path.ratios, path.x))
         k = int(np.argmax(np.abs(np.diff(values, 2)))) + 1
-        rows.append(
-            (label(mesh), float(ratios[k]), float(np.diff(values)[k]), int((np.asarray(path.status) != 0).sum()))
-        )
+        failed = int((np.asarray(path.status) != 0).sum())
+        rows.append((label(mesh), float(ratios[k]), float(np.diff(values)[k]), failed))
     report.table(("mesh", "sharpest bend at ratio", "change of tension there", "steps not OK"), rows)
 
 
 def main() -> None:
     parser = report.options(__doc__)
     parser.add_argument("--quick", action="store_true", help="every third mesh, and fewer repeats")
-    parser.add_argument("--poisson", type=float, nargs="+", default=POISSONS, help="Poisson's ratios")
+    parser.add_argument("--conditions", action="store_true", help="only the errors elsewhere")
     parser.add_argument("--crease", action="store_true", help="only show the crease on fine meshes")
     options = parser.parse_args()
     report.head("Error against time")
     if options.crease:
         crease()
-        return
-    for poisson in options.poisson:
-        truth, gap = references(poisson)
-        floor = float(np.nanmax(np.abs(100 * gap / truth)[:, :2]) / 3)
-        print(f"nu = {poisson}: angle, tension, length at {RATIOS}:\n{np.round(truth, 5)}")
-        print(f"error of this reference, a third of its distance from half the fineness: {floor:.4f} %\n")
-        repeats = 3 if options.quick else 7
-        rows = hand(poisson, truth, repeats)
-        for setting in settings(options.quick):
-            rows += errors(setting, poisson, truth, repeats)
-        print_rows(rows, poisson)
-        print("The cheapest setting for an error of angle and tension, over all ratios:\n")
-        report.table(("error", "setting", "error %", "over reference"), choose(rows, floor))
+    elif options.conditions:
+        elsewhere()
+    else:
+        compare(options.quick)
 
 
 if __name__ == "__main__":

@@ -4,31 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
-from jaxbeam.core.tree import Numbers, namespace
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
 from jaxbeam.physics.materials import POISSON
 from jaxbeam.physics.tendon import check_law, inverse_square_stiffness
+from jaxbeam.study.doubt import BY_HAND, outside
 
 # ------------------------------------------------------------------------------------ the hand calculation
 
 
-class Estimate(NamedTuple):
+@pytree
+class Estimate:
     """The result of the hand calculation.
 
     tip_angle: `()` in degrees.
     lengths: `(2,)` of the tendons, in the unit of length.
     tensions: `(2,)` of the tendons, in the unit of force.
+    warning: what lies outside the range in which the error was measured, in words; empty if nothing does, or if an
+        argument is traced.
     """
 
     tip_angle: jax.Array
     lengths: jax.Array
     tensions: jax.Array
+    warning: str = static_field(default="")
 
 
 @usual_rules
@@ -79,7 +85,17 @@ def euler_bernoulli(
     )
     check_law(stiffness)
     xp = namespace(*values)
-    return _by_hand(*(xp.asarray(value) for value in values), stiffness)
+    found = _by_hand(*(xp.asarray(value) for value in values), stiffness)
+    return replace(found, warning=_warning(*values, stiffness)) if is_concrete(*values) else found
+
+
+def _warning(
+    ratios: Any, length: Any, height: Any, young: Any, poisson: Any, modulus: Any, stiffness: Callable[..., Any]
+) -> str:
+    """What lies outside the range of `BY_HAND`, for concrete arguments."""
+    half = length / 2
+    k = np.asarray(stiffness(modulus, half), float)
+    return outside(BY_HAND, ratios, length / height, poisson, k * half**2 / (young * height**2))
 
 
 @partial(jax.jit, static_argnames="stiffness")
