@@ -58,6 +58,12 @@ def euler_bernoulli(
 
     The other half stays straight, so the tip rises by `kappa a^2 / 2 + kappa a a`.
 
+    Against converged triangles of `macklin_mueller` with the same constants, the tip angle and the tension of the
+    shortened tendon are within 6 %, if one tendon is shortened, to 0.8 or more, length over height is 2 to 6, Poisson's
+    ratio 0.45 to 0.49, and `tendon_modulus / (young height^2)` 0.06 to 0.32. On the reference beam at ratio 0.5 the
+    tension is 25 % off. At length over height 10 the angle is 16 % off at 0.8, and the tension twice what it should be
+    at 0.5. The `warning` tells what lies outside that range.
+
     Args:
         ratios: `(2,)` commanded ratios of the top and the bottom tendon.
         length: of the beam.
