@@ -36,7 +36,7 @@ from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.scene.evaluation import energy, evaluate, smallest_jacobian, stencil_hessians
 from jaxbeam.scene.rigid import check_held
-from jaxbeam.scene.scene import Scene, check_commands, command, extent
+from jaxbeam.scene.scene import Scene, check_commands, checked_commands, command, extent
 from jaxbeam.solve.implicit import attach_derivative
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
@@ -97,7 +97,7 @@ def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newt
     values = checks.shaped("ratios", ratios, None)
     if values.ndim not in (1, 2) or not all(values.shape[:-1]):
         raise ValueError(f"ratios: expected shape (m,), or (B, m) with a row for each command, got {values.shape}")
-    jax.eval_shape(command, meshes.coarse, jax.ShapeDtypeStruct(values.shape[-1:], meshes.coarse.mesh.nodes.dtype))
+    checked_commands("ratios", meshes.coarse, values if values.ndim == 1 else values[0])
     check_commands("ratios", meshes.coarse, values)
     rows = to_device(values, meshes.coarse.mesh.nodes.dtype)
     layout_of = lambda scene: solver.linear.layout(topology(scene))
