@@ -65,6 +65,18 @@ def reactions(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.where(scene.held, -forces(scene, x), 0)
 
 
+@jax.jit
+def second_change(scene: Scene, x: jax.Array, dx: jax.Array) -> jax.Array:
+    """Second derivative `(n, d)` of the gradient of the energy along `dx` `(n, d)`, at positions `x` `(n, d)`."""
+    total = jnp.zeros_like(x)
+    for term in scene.terms:
+        along = dx[term.nodes]
+        gradient = lambda at, term=term: term.kind.gradients(at, term.params)[1]
+        change = lambda at, gradient=gradient, along=along: jax.jvp(gradient, (at,), (along,))[1]
+        total = total.at[term.nodes].add(jax.jvp(change, (x[term.nodes],), (along,))[1])
+    return total
+
+
 def stencil_hessians(scene: Scene, x: jax.Array, convex: bool = False) -> list[jax.Array]:
     """For each term, the Hessians `(k d, k d, m)` of its stencils; with `convex`, positive semidefinite ones."""
     return [term.kind.hessians(x[term.nodes], term.params, convex) for term in scene.terms]

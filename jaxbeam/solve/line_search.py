@@ -1,4 +1,6 @@
-"""Line search: a step is halved until it lowers the energy.
+"""Line search: a step is shortened until it lowers the energy.
+
+Steps may be bent: of length `t` they lead from `x` to `x + t step + t^2 bend` (`jaxbeam.solve.newton` says why).
 
 A length is accepted by one of two conditions. Far from the solution Armijo's condition decides. Near it differences of
 energy are smaller than their round-off, and the slope decides, by the approximate Wolfe condition of Hager and Zhang
@@ -26,6 +28,9 @@ APPROXIMATE_WOLFE = 0.1
 
 MAX_HALVINGS = 40
 
+# A length is too long if its limit is less than this share of it. The limit is known within round-off only.
+WITHIN = 0.99
+
 # Round-off of an energy, over eps times its `magnitude` in `line_search`.
 ENERGY_ROUND_OFF = 4.0
 
@@ -51,37 +56,39 @@ def line_search(
     x: jax.Array,
     evaluation: Evaluation,
     step: jax.Array,
+    bend: jax.Array,
     initial: jax.Array,
     full: jax.Array,
     keep_volume: float,
 ) -> SearchResult:
     """Take a step, halved until the energy falls and the body does not close around an obstacle.
 
-    The first length tried is the largest, up to 1, at which no element loses more volume than `keep_volume` allows.
+    A length is too long if an element loses more volume than `keep_volume` allows, on the straight way to where it
+    leads. Then a bent step is tried straight, and a straight one at its largest length that is not too long.
 
     Args:
         scene: the scene to solve.
         x: `(n, d)` positions.
         evaluation: energy and gradient at `x`.
         step: `(n, d)` the full step.
+        bend: `(n, d)` its bend; zero for a straight step.
         initial: `()` whether this step leads to the start of Newton's method. Then `evaluation` is not known yet, and
-            the first length is accepted whatever the energy.
-        full: `()` whether the energy may rise. Then the first length with a finite energy is accepted.
+            the first length that keeps volume is accepted whatever the energy.
+        full: `()` whether the energy may rise. Then the first such length with a finite energy is accepted.
         keep_volume: fraction of its `J` that every element keeps (for exceptions see `largest_step`).
     """
     slope = jnp.sum(evaluation.gradient * step)
     # Round-off of the energy comes from the summation and from the round-off of the positions.
     magnitude = evaluation.energy_scale + jnp.max(jnp.abs(x)) * jnp.sum(evaluation.gradient_scale)
     round_off = ENERGY_ROUND_OFF * jnp.finfo(step.dtype).eps * magnitude
-    longest = jnp.minimum(1.0, largest_step(scene, x, step, keep_volume)).astype(step.dtype)
     downhill = initial | (jnp.isfinite(slope) & (slope < 0))
 
     def try_length(carry: Any) -> Any:
-        count, _, _, _ = carry
-        length = longest * 0.5 ** count.astype(step.dtype)
-        new_x = x + length * step
+        count, halvings, length, bend, _, _, _ = carry
+        move = length * (step + length * bend)
+        new_x = x + move
         new = evaluate(scene, new_x)
-        new_slope = jnp.sum(new.gradient * step)
+        new_slope = jnp.sum(new.gradient * (step + 2 * length * bend))
         armijo = new.energy <= evaluation.energy + ARMIJO * length * slope
         flat = (new.energy <= evaluation.energy + round_off) & (new_slope <= (2 * APPROXIMATE_WOLFE - 1) * slope)
         finite = jnp.isfinite(new.energy) & jnp.isfinite(new_slope)
@@ -90,11 +97,16 @@ def line_search(
             # The body may not pass an obstacle. Of the way to the start of the method the least is accepted all the
             # same, because there is no evaluation before it.
             accepted &= ~inside | (initial & (count == MAX_HALVINGS))
-        return count + 1, new_x, new, accepted
+        room, bent = largest_step(scene, x, move, keep_volume).astype(step.dtype), jnp.any(bend != 0)
+        long = (room < WITHIN) & (bent | (length == 1))
+        shorter = jnp.where(long, jnp.where(bent, length, room), 0.5 * length)
+        halved = (~long & ~accepted).astype(jnp.int32)
+        return count + 1, halvings + halved, shorter, jnp.where(long, 0, bend), new_x, new, accepted & ~long
 
-    begin = (jnp.zeros((), jnp.int32), x, evaluation, ~downhill)
-    going = lambda carry: ~carry[3] & (carry[0] <= MAX_HALVINGS)
-    count, new_x, new, accepted = lax.while_loop(going, try_length, begin)
+    none = jnp.zeros((), jnp.int32)
+    begin = (none, none, jnp.ones((), step.dtype), bend, x, evaluation, ~downhill)
+    going = lambda carry: ~carry[-1] & (carry[0] <= MAX_HALVINGS)
+    _, halvings, _, _, new_x, new, accepted = lax.while_loop(going, try_length, begin)
     moved = downhill & accepted
     new_x, new = choose(moved, (new_x, new), (x, evaluation))
-    return SearchResult(new_x, new, jnp.maximum(count - 1, 0), moved)
+    return SearchResult(new_x, new, halvings, moved)

@@ -4,6 +4,12 @@ A step solves `K dx = -g`, with the gradient `g` of the energy and a positive de
 (`jaxbeam.solve.stiffness`), and is shortened by a line search (`jaxbeam.solve.line_search`). The iteration ends when
 the relative residual (`jaxbeam.solve.residual`) is small. At a solution the Cholesky factor of the true Hessian exists
 if and only if the equilibrium is stable.
+
+A straight step stretches what it turns. So the energy rises, and the step is cut where nothing else is wrong with it.
+Long steps are therefore bent, where `K` is the true Hessian. They follow the Newton path `g(x(t)) = (1 - t) g(x)`, on
+which all unbalanced forces fall alike (Deuflhard 2004, Newton Methods for Nonlinear Problems, section 3.1.4), to
+second order: `x(t) = x + t dx + t^2 c` with `K c = -1/2 D^3 E[dx, dx]`. A full one is a step of Chebyshev's method, of
+third order.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ from jaxbeam.core.tree import key_of
 from jaxbeam.linear.blocks import Topology
 from jaxbeam.linear.layout import Layout, LinearSolver, expand, gather
 from jaxbeam.linear.tridiagonal import BlockTridiagonal
-from jaxbeam.scene.evaluation import Evaluation, evaluate
+from jaxbeam.scene.evaluation import Evaluation, evaluate, second_change
 from jaxbeam.scene.scene import Scene, check_scene, extent, has_supports, places
 from jaxbeam.solve.line_search import line_search
 from jaxbeam.solve.residual import force_round_off, force_scale, relative_residual
@@ -32,6 +38,9 @@ from jaxbeam.solve.stiffness import Stiffness, factorise, is_singular, zero_fact
 # A step shorter than this, over the size of the body, changes the stiffness of the softest mode by as small a fraction,
 # so the factor may be reused.
 NEAR = 1e-6
+
+# Steps that move a node by more than this, over the size of the body, are bent. Shorter ones gain nothing by it.
+BENT = 1e-4
 
 # A solution is inaccurate if one more step would move a node by more than this, over the size of the body. Up to
 # `POLISH` steps are spent on making it accurate.
@@ -137,6 +146,7 @@ class State(NamedTuple):
     evaluation: energy and gradient at `x`.
     stiffness: stiffness at `x`, or where the last step began if its factor was reused.
     step: `(n, d)` the step to take next.
+    bend: `(n, d)` second-order term of the way there; zero for a straight step.
     response: `(n, d)` solution of `K response = -probe` at `x`.
     correction: `()` largest component of `step`, over the size of the body.
     singular: `()` whether the lowest eigenvalue of the stiffness is within round-off of zero. Known at the end only.
@@ -150,6 +160,7 @@ class State(NamedTuple):
     evaluation: Evaluation
     stiffness: Stiffness
     step: jax.Array
+    bend: jax.Array
     response: jax.Array
     correction: jax.Array
     singular: jax.Array
@@ -215,6 +226,7 @@ def init(problem: Problem, x: jax.Array, displacement: jax.Array) -> State:
         evaluation=Evaluation(zero, zero, zeros, zeros),
         stiffness=Stiffness(factor, yes, ~yes, ~yes, zero, zero, zeros),
         step=displacement,
+        bend=zeros,
         response=zeros,
         correction=zero,
         singular=~yes,
@@ -233,7 +245,7 @@ def step(problem: Problem, state: State) -> State:
     # A step that moves supports does work, so it may raise the energy.
     forced = state.initial if problem.places is None else state.initial | jnp.any(_gap(problem, state.x) != 0)
     x, evaluation, halvings, moved = line_search(
-        scene, state.x, state.evaluation, state.step, forced, full, solver.keep_volume
+        scene, state.x, state.evaluation, state.step, state.bend, forced, full, solver.keep_volume
     )
     if problem.places is not None:
         x = jnp.where(scene.held & (_gap(problem, x) == 0), problem.places, x)
@@ -261,6 +273,7 @@ def step(problem: Problem, state: State) -> State:
         evaluation=evaluation,
         stiffness=stiffness,
         step=next_step,
+        bend=jnp.zeros_like(x),
         response=response,
         correction=correction,
         singular=state.singular,
@@ -269,7 +282,10 @@ def step(problem: Problem, state: State) -> State:
         initial=jnp.asarray(False),
         running=moved,
     )
-    return after._replace(running=moved & ~terminate(problem, state, after, balanced, polish))
+    running = moved & ~terminate(problem, state, after, balanced, polish)
+    bent = running & stiffness.definite & (correction > BENT)
+    bend = compute_if(bent, partial(_bend, problem), after.bend, x, stiffness.factor, next_step)
+    return after._replace(bend=bend, running=running)
 
 
 def terminate(problem: Problem, before: State, after: State, balanced: jax.Array, polish: jax.Array) -> jax.Array:
@@ -343,6 +359,21 @@ def _solve(
     moves = problem.solver.linear.solve(problem.layout, stiffness.factor, loads)
     moves = jax.vmap(lambda move: expand(problem.layout, -move, x.shape), in_axes=1)(moves)
     return moves[0] + gap, response + moves[1]
+
+
+def _bend(problem: Problem, x: jax.Array, factor: Any, step: jax.Array) -> jax.Array:
+    """The bend `(n, d)` of a step, zero where it is longer than the step: the series is of no use there.
+
+    Args:
+        problem: what does not change.
+        x: `(n, d)` positions.
+        factor: factor of the true Hessian there.
+        step: `(n, d)` the step.
+    """
+    load = gather(problem.layout, second_change(problem.scene, x, step))
+    bend = expand(problem.layout, -0.5 * problem.solver.linear.solve(problem.layout, factor, load), x.shape)
+    short = jnp.max(jnp.abs(bend)) <= jnp.max(jnp.abs(step))
+    return jnp.where(short, bend, 0)
 
 
 def _count(state: State, taken: jax.Array, halvings: jax.Array, polish: jax.Array) -> Counts:
