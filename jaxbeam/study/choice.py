@@ -7,14 +7,19 @@ one solve after compiling, over that of one jump of the reference scene, by `pyt
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
+from jaxbeam.physics.materials import POISSON
 from jaxbeam.scene.beams import rod_beam, tendon_beam
 from jaxbeam.scene.scene import Scene
+
+# Relative difference up to which a value counts as one that was measured.
+NEAR = 1e-6
 
 
 class Row(NamedTuple):
@@ -26,10 +31,7 @@ class Row(NamedTuple):
     time: over that of one jump of the reference scene.
     reference: error on the reference beam, with one tendon pulled.
     both: with both tendons pulled.
-    slenderness: at length over height 2, 3, 6 and 10.
-    poisson: at Poisson's ratio 0.3, 0.49 and 0.499.
-    stiff: with tendons five times as stiff.
-    width: with anchors of 0.125 and 0.5.
+    slenderness, poisson, stiffness, width: at the values of `AXES` that are not those of the reference beam.
     """
 
     name: str
@@ -38,10 +40,38 @@ class Row(NamedTuple):
     time: float
     reference: float
     both: float
-    slenderness: tuple[float, float, float, float]
-    poisson: tuple[float, float, float]
-    stiff: float
-    width: tuple[float, float]
+    slenderness: tuple[float, ...]
+    poisson: tuple[float, ...]
+    stiffness: tuple[float, ...]
+    width: tuple[float, ...]
+
+
+class Axis(NamedTuple):
+    """One thing in which beams differ.
+
+    name: in words.
+    values: at which errors were measured, increasing.
+    reference: which of them is that of the reference beam.
+    """
+
+    name: str
+    values: tuple[float, ...]
+    reference: int
+
+    def factor(self, of_reference: float, elsewhere: tuple[float, ...], value: float) -> float:
+        """The larger of the errors measured at the two values around `value`, over that of the reference beam."""
+        errors = [*elsewhere[: self.reference], of_reference, *elsewhere[self.reference :]]
+        above = min(bisect_left(self.values, value * (1 - NEAR)), len(errors) - 1)
+        exact = abs(self.values[above] - value) <= NEAR * value
+        return max(errors[above if exact else max(above - 1, 0)], errors[above]) / of_reference
+
+
+AXES = {
+    "slenderness": Axis("length / height", (2, 3, 4.375, 6, 10), 2),
+    "poisson": Axis("Poisson's ratio", (0.3, 0.45, 0.49, 0.499), 1),
+    "stiffness": Axis("tendon_modulus / (young height^2)", (0.3125, 1.5625), 0),
+    "width": Axis("anchor_width / height", (0.15625, 0.3125, 0.625), 1),
+}
 
 
 class Choice(NamedTuple):
@@ -61,3 +91,71 @@ class Choice(NamedTuple):
     error: float
     time: float
     doubt: str
+
+
+@usual_rules
+def choose(
+    error: float,
+    length: float = 3.5,
+    height: float = 0.8,
+    young: float = 1e4,
+    poisson: float = 0.45,
+    tendon_modulus: float = 2e3,
+    anchor_width: float = 0.25,
+    both: bool = False,
+) -> Choice:
+    """The cheapest way to solve a tendon beam to an error of its tip angle and tension.
+
+    It reads a table that was measured; nothing is solved. The other arguments describe the beam as those of
+    `tendon_beam` do. Where the beam differs from the reference in several things, their effects are multiplied.
+
+    Args:
+        error: largest relative error of tip angle and tension that you can live with, such as 0.01.
+        length: of the beam.
+        height: of the beam.
+        young: Young's modulus.
+        poisson: Poisson's ratio.
+        tendon_modulus: of the law `modulus / l*^2`.
+        anchor_width: width of the patch of surface that the free end of a tendon pulls on.
+        both: whether both tendons are pulled.
+
+    Raises:
+        ValueError: if a number is out of its range, or no measured setting is expected to err by so little.
+    """
+    error = checks.setting("error", error, checks.POSITIVE)
+    described = {"length": length, "height": height, "young": young, "tendon_modulus": tendon_modulus}
+    for name, value in described.items():
+        checks.setting(name, value, checks.POSITIVE)
+    poisson = checks.setting("poisson", poisson, POISSON)
+    anchor_width = checks.setting("anchor_width", anchor_width, checks.NOT_NEGATIVE)
+    checks.flag("both", both)
+    asked = {
+        "slenderness": length / height,
+        "poisson": poisson,
+        "stiffness": tendon_modulus / (young * height**2),
+        "width": anchor_width / height,
+    }
+    outside = [
+        f"{axis.name} {asked[key]:.4g} (measured from {axis.values[0]:g} to {axis.values[-1]:g})"
+        for key, axis in AXES.items()
+        if not axis.values[0] * (1 - NEAR) <= asked[key] <= axis.values[-1] * (1 + NEAR)
+    ]
+    doubt = f"outside of what was measured: {'; '.join(outside)}" if outside else ""
+    expected = [(_expected(row, asked, both), row) for row in TABLE]
+    fit = [(row.time, found, row) for found, row in expected if found <= 100 * error]
+    if not fit:
+        least = min(found for found, _ in expected)
+        raise ValueError(
+            f"error: expected at least {least / 100:.2g} for this beam, got {error:g}: no setting that was measured "
+            f"errs by less; refine with solve_to, which tells its own error bar"
+        )
+    time, found, row = min(fit, key=lambda each: each[0])
+    return Choice(row.name, row.scene, row.two_meshes, found / 100, time, doubt)
+
+
+def _expected(row: Row, asked: dict[str, float], both: bool) -> float:
+    """The error in percent of a way to solve, for a beam that differs from the reference."""
+    error = row.both if both else row.reference
+    for key, axis in AXES.items():
+        error *= axis.factor(row.reference, getattr(row, key), asked[key])
+    return error
