@@ -15,7 +15,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, pytree, replace, static_field
 from jaxbeam.physics.materials import POISSON
 from jaxbeam.physics.tendon import check_law, inverse_square_stiffness
-from jaxbeam.study.doubt import BY_HAND, outside
+from jaxbeam.study.model_doubt import BY_HAND, outside
 
 # ------------------------------------------------------------------------------------ the hand calculation
 

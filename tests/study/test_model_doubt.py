@@ -7,7 +7,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.physics.rod_tendon import rod_tendons
-from jaxbeam.study.doubt import BY_HAND, ROD
+from jaxbeam.study.model_doubt import BY_HAND, ROD
 
 # The reference beam, from the truth of `python -m benchmarks accuracy`, within 0.01 %: ratios of the top and the
 # bottom tendon, tip angle, tensions.
