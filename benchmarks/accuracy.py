@@ -58,6 +58,9 @@ MIRRORED = ((9, 5), (11, 5), (13, 5), (15, 7), (17, 9), (21, 9), (25, 13), (33, 
 CROSSED = ((9, 4), (11, 4), (13, 5), (17, 6), (21, 7), (25, 9), (33, 12))
 # Three-node crossed ones.
 THREE = ((21, 5), (29, 7), (41, 11), (57, 15))
+# Coarse meshes of solves on two: of three-node crossed triangles, and of six-node mirrored ones.
+TWO_THREE = ((7, 4), (8, 4), (9, 5), (11, 5), (13, 6), (15, 6))
+TWO_SIX = ((9, 5), (13, 7), (17, 9), (21, 11))
 # Settings whose errors are told elsewhere.
 ELSEWHERE = (
     "by hand",
@@ -118,6 +121,18 @@ def rod(given: dict[str, Any], nodes: int) -> Ready:
     return Ready(partial(solved, scene, jb.Newton(), 0), partial(measured, scene))
 
 
+def two(given: dict[str, Any], **mesh: Any) -> Ready:
+    """A beam of triangles, solved on two meshes."""
+    meshes = jb.two_meshes(jb.tendon_beam(**({"anchor_width": WIDTH} | given | mesh)))
+    told = lambda command, found: np.where(found.solution.status == 0, found.value, np.nan)
+    return Ready(lambda command: jb.corrected(meshes, command, measures), told)
+
+
+def measures(scene: jb.Scene, x: Any) -> jax.Array:
+    """Tip angle and the tensions of both tendons `(3,)`."""
+    return jnp.append(jb.tip_angle(scene, x), jb.tendon_tensions(scene, x))
+
+
 def linear(given: dict[str, Any], **mesh: Any) -> Ready:
     """Linear elasticity."""
     scene = jb.tendon_beam(**({"anchor_width": WIDTH} | given | mesh))
@@ -144,8 +159,7 @@ def measured(scene: jb.Scene, command: np.ndarray, found: Any) -> np.ndarray:
         if found.status != 0:
             return np.full(3, np.nan)
         found = found.x
-    scene = jb.command(scene, command)
-    return np.array([jb.tip_angle(scene, found), *jb.tendon_tensions(scene, found)], float)
+    return np.asarray(measures(jb.command(scene, command), found))
 
 
 def settings(quick: bool) -> list[Setting]:
@@ -173,6 +187,12 @@ def settings(quick: bool) -> list[Setting]:
     ]
     for mesh in meshes[::3] if quick else meshes:
         found.append(Setting(label(mesh), partial(beam, **mesh)))
+    for nx, ny in TWO_THREE:
+        mesh = {"nx": nx, "ny": ny} | near | crossed | {"order": 1}
+        found.append(Setting(f"two meshes, {label(mesh)}", partial(two, **mesh)))
+    for nx, ny in TWO_SIX:
+        mesh = {"nx": nx, "ny": ny} | near | mirrored
+        found.append(Setting(f"two meshes, {label(mesh)}", partial(two, **mesh)))
     base = {"nx": 9, "ny": 5, "order": 2, "graded": True}
     for name, extra in (
         ("float32", {"dtype": jnp.float32}),

@@ -105,8 +105,8 @@ from jaxbeam.study.corrected import corrected as corrected
 from jaxbeam.study.design import Design as Design
 from jaxbeam.study.design import DesignStatus as DesignStatus
 from jaxbeam.study.design import History as History
-from jaxbeam.study.model_doubt import model_doubt as model_doubt
 from jaxbeam.study.minimise import minimise as minimise
+from jaxbeam.study.model_doubt import model_doubt as model_doubt
 from jaxbeam.study.reach import reach as reach
 from jaxbeam.study.reach import reach_each as reach_each
 from jaxbeam.study.stability import Modes as Modes

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.physics.materials import POISSON
-from jaxbeam.scene.beams import rod_beam, tendon_beam
 from jaxbeam.scene.scene import Scene
 
 # Relative difference up to which a value counts as one that was measured.
