@@ -136,6 +136,13 @@ def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
     return read_only(every[count[number] == 1])
 
 
+def longest_edge(mesh: Mesh, node: int) -> float:
+    """Length of the longest edge of the surface that ends at a corner `node` on it, measured straight."""
+    edges, positions = surface(mesh), np.asarray(mesh.nodes, float)
+    ends = positions[edges[(edges[:, :2] == node).any(axis=1), :2]]
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
+
+
 def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
     """The edges `(m, k)` of the surface of which both corners are among `nodes`.
 

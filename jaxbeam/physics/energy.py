@@ -43,6 +43,7 @@ class Energy:
     name: ClassVar[str] = "term"  # word for a stencil in pictures and messages
     body: ClassVar[bool] = False  # elastic material: the energy is a strain energy, unchanged by rigid motions
     fills: ClassVar[bool] = False  # the stencils are elements of area, whose outer edges are the surface of the body
+    pointwise: ClassVar[bool] = False  # pushes single nodes, where displacements grow without end under refinement
     holds: tuple[bool, ...] = ()  # coordinates of its nodes that a support holds, `(d,)`; none of any other energy
     coordinates: ClassVar[int | None] = None  # number `d` that a node must have: 2, or 3 on a rod; None: any
     rest_command: ClassVar[float | None] = None  # command at which the term does nothing; None: it has no command
@@ -135,8 +136,14 @@ class Energy:
         """
         raise NotRefinable("it does not say what it becomes on a finer mesh (see Energy.refined)")
 
-    def without_limit(self, term: Term, free: np.ndarray) -> str:
-        """Why the answer has no limit as the mesh is refined; empty if it has. `free` `(n,)`: whether a node moves."""
+    def without_limit(self, term: Term, mesh: Mesh, free: np.ndarray) -> str:
+        """Why no error of the answer can be told from this mesh, such as a point load; empty if it can.
+
+        Args:
+            term: the term.
+            mesh: of the scene, with concrete nodes.
+            free: `(n,)` whether a node moves.
+        """
         return ""
 
     # -------------------------------------------------------------------------- measures and pictures

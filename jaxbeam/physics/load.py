@@ -33,6 +33,7 @@ class DeadLoadEnergy(Energy):
     """`-f . (x - X)`: a force `f` of constant size and direction on one node, with rest position `X`."""
 
     name: ClassVar[str] = "load"
+    pointwise: ClassVar[bool] = True
 
     def __call__(self, x: jax.Array, params: PointParams) -> jax.Array:
         return -jnp.sum(params.value * (x[0] - params.rest))

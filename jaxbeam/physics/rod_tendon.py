@@ -54,7 +54,7 @@ class RodTendonEnergy(TendonEnergy):
     def refined(self, term: Term, mesh: Mesh, finer: Finer) -> Term:
         raise NotRefinable("it is tied to the sections of a rod")
 
-    def without_limit(self, term: Term, free: np.ndarray) -> str:
+    def without_limit(self, term: Term, mesh: Mesh, free: np.ndarray) -> str:
         return ""
 
     def arms(self, x: jax.Array, params: TendonParams) -> jax.Array:

@@ -19,8 +19,11 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
-from jaxbeam.mesh.surface import patch
+from jaxbeam.mesh.surface import longest_edge, patch
 from jaxbeam.physics.energy import Energy, Term, check_nodes
+
+# An anchor whose width is below this share of the edges beside it is a point load to the mesh.
+NARROW = 0.25
 
 # -------------------------------------------------------------------------------------------- tendons
 
@@ -102,10 +105,19 @@ class LineEnergy(Energy):
         """Tension `dE/dl` `()`, the same along the whole line; positive if it pulls."""
         raise NotImplementedError
 
-    def without_limit(self, term: Term, free: np.ndarray) -> str:
-        if term.params.width is not None or not free[term.nodes].any():
-            return ""
-        return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+    def without_limit(self, term: Term, mesh: Mesh, free: np.ndarray) -> str:
+        ends, widths = term.nodes, np.zeros(term.nodes.shape)
+        if term.params.width is not None:
+            ends, widths = np.asarray(term.params.ends), np.asarray(term.params.width)
+        if (free[ends] & (widths == 0)).any():
+            return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+        for node, width in zip(ends[free[ends]].tolist(), widths[free[ends]].tolist(), strict=True):
+            if width < NARROW * (edge := longest_edge(mesh, node)):
+                return (
+                    f"the anchor of width {width:.3g} at node {node} is too narrow for the edges of the surface, of "
+                    f"length {edge:.3g}; use a mesh with edges of at most {width / NARROW:.3g} there, or a wider anchor"
+                )
+        return ""
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
         return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}

@@ -151,7 +151,7 @@ def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
     x = placed(scene, x)
     total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
     for term, stress in _at_points(scene, x, _stress):
-        recover = jnp.asarray(_points_to_nodes(element_of(term.nodes), stress.shape[1]), x.dtype)
+        recover = jnp.asarray(points_to_nodes(element_of(term.nodes), stress.shape[1]), x.dtype)
         areas = jnp.sum(term.params.weights, axis=1)
         total = total.at[term.nodes].add(jnp.einsum("kq,mqij,m->mkij", recover, stress, areas))
         area = area.at[term.nodes].add(areas[:, None])
@@ -193,7 +193,7 @@ def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]
     return jnp.concatenate([mean(term.params.weights, values) for term, values in _at_points(scene, x, measure)])
 
 
-def _points_to_nodes(element: Element, points: int) -> np.ndarray:
+def points_to_nodes(element: Element, points: int) -> np.ndarray:
     """The matrix `(k, q)` from values at `q` quadrature points to those of the field that fits them best, at the `k`
     nodes of the element. The field is linear in the weights of the corners. Too few points do not fix it: of those
     that fit the least is taken, which for one point is constant."""

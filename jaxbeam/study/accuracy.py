@@ -30,11 +30,12 @@ from jaxbeam.mesh.elements import element_of
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer, enriched_elements, heirs
 from jaxbeam.physics.energy import NotRefinable, Term
-from jaxbeam.scene.evaluation import evaluate, stencil_hessians
+from jaxbeam.scene.evaluation import evaluate, smallest_jacobian, stencil_hessians
 from jaxbeam.scene.scene import Scene, check_scene
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
+from jaxbeam.study.doubt import SOFT, Softest, reads_corner, reads_load, scene_doubt, softest, squashed, takes_worst
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
 
@@ -42,7 +43,7 @@ Measure = Callable[[Scene, jax.Array], jax.Array]
 # Safety factor: the error bar over the estimated error.
 SAFETY = 1.5
 # Share of the parts of the estimate that cancel, added to the bar: parts of opposite sign need not shrink alike.
-UNLIKE = 0.25
+UNLIKE = 0.5
 # The estimate is repeated, each time after a Newton step, until that step changes the measure by at most this share of
 # the whole change, but not more than `MOST_STEPS` times.
 SETTLED = 0.1
@@ -58,9 +59,9 @@ class ErrorEstimate(NamedTuple):
     value: the measure of the solution.
     discretisation: signed estimate of the error of the mesh: value + discretisation is a better value.
     algebraic: signed estimate of the error that the solver leaves.
-    bar: bound of the error of `value`. It is infinite if the solution is not `OK`, if the answer has no limit as the
-        mesh is refined, if a term does not say what it becomes on a finer mesh, or if that has no stable equilibrium
-        near.
+    bar: bound of the error of `value`. It is infinite if the solution is not `OK`, if a term does not say what it
+        becomes on a finer mesh, if that has no stable equilibrium near, or for a reason of `jaxbeam.study.doubt`: point
+        loads and narrow anchors, measures of a place where strains are infinite, a surface that may crease.
     reason: why the bar is infinite; empty if it is finite.
     """
 
@@ -80,6 +81,7 @@ class Answer(NamedTuple):
     rung: how often the mesh was refined.
     scene: on the last mesh.
     solution: of that scene.
+    reason: why the tolerance was not met; empty if it was.
     """
 
     value: float
@@ -88,6 +90,7 @@ class Answer(NamedTuple):
     rung: int
     scene: Scene
     solution: Solution
+    reason: str = ""
 
 
 @usual_rules
@@ -118,8 +121,9 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
     """Solve a scene, and refine its mesh until the error bar of a measure is within a tolerance.
 
     The solve on a finer mesh starts from the positions that the error estimate on the mesh before predicts, so that two
-    or three Newton steps are left. Begin with a coarse mesh: refinement stops at the first mesh that suffices. A
-    tolerance below the round-off of the value cannot be met on any mesh; then the mesh is not refined.
+    or three Newton steps are left. Begin with a coarse mesh: refinement stops at the first mesh that suffices. Where it
+    stops before, `Answer.reason` says why: the bar is infinite, the next mesh would be too large, or the tolerance is
+    below the round-off of the value.
 
     Args:
         scene: under its commands; concrete.
@@ -140,11 +144,21 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         solution = equilibrium(scene, start, solver)
         estimate, finer, ahead = _estimate(scene, solution, measure, solver)
         met = estimate.bar <= tolerance
-        stuck = bool(solution.status != 0) or not np.isfinite(estimate.bar)
-        hopeless = tolerance < float(jnp.finfo(solution.x.dtype).eps) * abs(estimate.value)
-        if met or stuck or hopeless or not np.count_nonzero(~finer.held) <= most:
-            return Answer(estimate.value, estimate, met, rung, scene, solution)
+        reason = "" if met else _stop(estimate, tolerance, float(jnp.finfo(solution.x.dtype).eps), finer, most)
+        if met or reason:
+            return Answer(estimate.value, estimate, met, rung, scene, solution, reason)
         rung, scene, start = rung + 1, finer, ahead
+
+
+def _stop(estimate: ErrorEstimate, tolerance: float, eps: float, finer: Scene, most: int) -> str:
+    """Why the mesh is not refined although the bar is above the tolerance; empty if it is."""
+    if not np.isfinite(estimate.bar):
+        return estimate.reason
+    if tolerance < (least := eps * abs(estimate.value)):
+        return f"the tolerance {tolerance:.3g} is below the round-off of the value, {least:.3g}"
+    if (count := np.count_nonzero(~finer.held)) > most:
+        return f"the next mesh has {count} unknowns, more than the {most} of `most`"
+    return ""
 
 
 @usual_rules
@@ -200,7 +214,7 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
     except NotRefinable as error:
         return ErrorEstimate(value, np.nan, algebraic, np.inf, str(error)), scene, solution.x
     start = way.carry(np.asarray(solution.x))
-    step = _change(finer, start, measure, solver, way)
+    first = step = _change(finer, start, measure, solver, way)
     change, cancelled = step.total, min(step.parts[step.parts > 0].sum(), -step.parts[step.parts < 0].sum())
     near = SMALL * np.ptp(np.asarray(scene.mesh.nodes), axis=0).max()
     for _ in range(MOST_STEPS):
@@ -217,19 +231,58 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
         moved, change = np.asarray(found.x), float(measure(finer, found.x)) - value if found.status == 0 else np.nan
     left = change * element_of(scene.mesh.elements).shortfall
     reason = _doubt(scene, solution, change)
+    if not reason:
+        reason = _doubt_of_state(scene, solution.x, finer, moved, own.slope, first.slope, measure)
     bar = np.inf if reason else SAFETY * abs(left) + UNLIKE * cancelled + abs(algebraic)
-    return ErrorEstimate(value, left, algebraic, bar, reason), finer, moved
+    # Positions after a Newton step may be inverted. Those that were carried over are not.
+    usable = np.isfinite(moved).all() and float(smallest_jacobian(finer, jnp.asarray(moved))) > 0
+    return ErrorEstimate(value, left, algebraic, bar, reason), finer, moved if usable else start
 
 
 def _doubt(scene: Scene, solution: Solution, change: float) -> str:
-    """Why no error bound is known; empty if one is."""
+    """Why no error bound is known of any measure of a solution; empty if one is."""
     if solution.status != 0:
         return "the solution is not OK"
-    free = np.logical_not(scene.held.all(axis=1))
-    for term in scene.terms:
-        if reason := term.kind.without_limit(term, free):
-            return reason
+    if reason := scene_doubt(scene):
+        return reason
     return "" if np.isfinite(change) else "the finer mesh has no stable equilibrium near"
+
+
+def _doubt_of_state(
+    scene: Scene, x: Any, finer: Scene, moved: Any, slope: np.ndarray, finer_slope: np.ndarray, measure: Measure
+) -> str:
+    """Why the change to the finer mesh bounds no error, by the states and the derivatives of the measure on both."""
+    other = _value_and_slope(scene, squashed(scene, x), measure)[1]
+    point, corner, worst, soft = _state(scene, x, finer, moved, slope, finer_slope, other)
+    if point:
+        return "the measure reads positions at the node of a point load, where displacements grow without end"
+    if corner:
+        return "the measure reads strains at an end of a clamp or a re-entrant corner, where they are infinite"
+    if worst:
+        return "the measure is the worst value in the body, and at an end of a clamp or a corner strains are infinite"
+    if soft.share < SOFT:
+        place = ", ".join(f"{value:.3g}" for value in soft.place)
+        return (
+            f"the surface may crease: at ({place}) it is compressed to {float(soft.stretch):.2f} of its length and has "
+            f"{float(soft.share):.0%} of its stiffness left, and a finer mesh may give another answer"
+        )
+    return ""
+
+
+@jax.jit
+def _state(
+    scene: Scene,
+    x: jax.Array,
+    finer: Scene,
+    moved: jax.Array,
+    slope: jax.Array,
+    finer_slope: jax.Array,
+    other: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array, Softest]:
+    """Whether the measure reads a point load, a corner, or the worst value; and the softest piece of the surface."""
+    point = reads_load(scene, finer, x, slope, finer_slope)
+    corner, worst = reads_corner(scene, finer, slope, finer_slope), takes_worst(scene, slope, other)
+    return point, corner, worst, softest(finer, moved)
 
 
 class _Change(NamedTuple):
@@ -240,6 +293,7 @@ class _Change(NamedTuple):
     length: largest component of the step.
     total: change of the measure by the step, to first order.
     parts: `(n, 2)` contribution of the force and the adjoint at each coordinate to that change.
+    slope: `(n, 2)` derivative of the measure in the positions.
     factor: of the stiffness that was used, and whether that is positive definite.
     """
 
@@ -248,6 +302,7 @@ class _Change(NamedTuple):
     length: float
     total: float
     parts: np.ndarray
+    slope: np.ndarray
     factor: Any
 
 
@@ -271,9 +326,8 @@ def _change(
     found = _newton_step(unlock(scene), layout, factor, x, slope, solver)
     slope, step, adjoint, forces = (np.asarray(each) for each in (slope, *found))
     local = adjoint if way is None else adjoint - way.carry(adjoint)
-    return _Change(
-        float(value), x + step, float(np.abs(step).max()), float(np.sum(slope * step)), -local * forces, factor
-    )
+    length, total = float(np.abs(step).max()), float(np.sum(slope * step))
+    return _Change(float(value), x + step, length, total, -local * forces, slope, factor)
 
 
 @compiled("solver")
