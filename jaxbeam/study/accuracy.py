@@ -264,7 +264,7 @@ def _doubt_of_state(
         place = ", ".join(f"{value:.3g}" for value in soft.place)
         return (
             f"the surface may crease: at ({place}) it is compressed to {float(soft.stretch):.2f} of its length and has "
-            f"{float(soft.share):.0%} of its stiffness left, and a finer mesh may give another answer"
+            f"{max(float(soft.share), 0):.0%} of its stiffness left, and a finer mesh may give another answer"
         )
     return ""
 
