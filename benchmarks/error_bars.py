@@ -45,7 +45,8 @@ MESHES: tuple[dict[str, Any], ...] = (
     {"nx": 17, "ny": 6, "order": 2, "graded": True, "diagonals": "crossed"},
 )
 # Width of the anchors over the length of the beam, and the lowest ratio of a tendon: narrow anchors cut into the body.
-WIDTHS = ((0.0014, 0.9), (0.01, 0.85), (0.03, 0.75), (0.05, 0.65), (0.07, 0.6), (0.07, 0.6), (0.1, 0.55), (0.14, 0.55))
+WIDTHS = (0.0014, 0.01, 0.02, 0.03, 0.05, 0.07, 0.07, 0.07, 0.1, 0.14)
+LOWEST = (0.9, 0.85, 0.8, 0.75, 0.65, 0.6, 0.6, 0.6, 0.55, 0.55)
 # Relative error of the truth: of the measures, and of stresses at a point.
 TRUTH, POINTS = 5e-5, 2e-3
 # Relative error of the mesh `FINEST`.
@@ -201,8 +202,8 @@ def bars(seed: int, groups: int) -> list[dict[str, Any]]:
     """Bars of four random scenes in each group."""
     rng, rows = np.random.default_rng(seed), []
     for group in range(groups):
-        settings, (width, lowest) = MESHES[rng.integers(len(MESHES))], WIDTHS[rng.integers(len(WIDTHS))]
-        for beam in [draw(rng, width, lowest) for _ in range(4)]:
+        settings, kind = MESHES[rng.integers(len(MESHES))], rng.integers(len(WIDTHS))
+        for beam in [draw(rng, WIDTHS[kind], LOWEST[kind]) for _ in range(4)]:
             found = judged(beam, jb.rectangle(beam.length, HEIGHT, **settings), rng)
             rows += [row | {"mesh": settings} for row in found]
             held, count = sum(row["held"] for row in found), len(found)

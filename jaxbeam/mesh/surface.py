@@ -136,11 +136,11 @@ def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
     return read_only(every[count[number] == 1])
 
 
-def longest_edge(mesh: Mesh, node: int) -> float:
-    """Length of the longest edge of the surface that ends at a corner `node` on it, measured straight."""
+def node_spacing(mesh: Mesh, node: int) -> float:
+    """The largest distance of neighbouring nodes of the surface, beside a corner `node` on it, measured straight."""
     edges, positions = surface(mesh), np.asarray(mesh.nodes, float)
     ends = positions[edges[(edges[:, :2] == node).any(axis=1), :2]]
-    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max()) / (edges.shape[1] - 1)
 
 
 def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:

@@ -146,6 +146,11 @@ class Energy:
         """
         return ""
 
+    def resolution(self, term: Term, mesh: Mesh, free: np.ndarray) -> dict[int, float]:
+        """Of each patch of surface that it acts on, by its node: the width over the distance of nodes there. Arguments
+        as of `without_limit`."""
+        return {}
+
     # -------------------------------------------------------------------------- measures and pictures
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:

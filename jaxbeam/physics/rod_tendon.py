@@ -57,6 +57,9 @@ class RodTendonEnergy(TendonEnergy):
     def without_limit(self, term: Term, mesh: Mesh, free: np.ndarray) -> str:
         return ""
 
+    def resolution(self, term: Term, mesh: Mesh, free: np.ndarray) -> dict[int, float]:
+        return {}
+
     def arms(self, x: jax.Array, params: TendonParams) -> jax.Array:
         return jnp.stack([x[..., :2], self.line(x, params)], axis=-2)
 

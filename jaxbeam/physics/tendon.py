@@ -19,11 +19,11 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers, index_field, is_concrete, namespace, pytree, replace, to_device
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.mesh.refinement import Finer
-from jaxbeam.mesh.surface import longest_edge, patch
+from jaxbeam.mesh.surface import node_spacing, patch
 from jaxbeam.physics.energy import Energy, Term, check_nodes
 
-# An anchor whose width is below this share of the edges beside it is a point load to the mesh.
-NARROW = 0.25
+# An anchor whose width is below this share of the distance of the nodes beside it is a point load to the mesh.
+NARROW = 0.1
 
 # -------------------------------------------------------------------------------------------- tendons
 
@@ -106,18 +106,28 @@ class LineEnergy(Energy):
         raise NotImplementedError
 
     def without_limit(self, term: Term, mesh: Mesh, free: np.ndarray) -> str:
+        found = self.resolution(term, mesh, free)
+        node = min(found, key=found.__getitem__, default=-1)
+        if node < 0 or found[node] >= NARROW:
+            return ""
+        if found[node] == 0:
+            return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+        spacing = node_spacing(mesh, node)
+        width = found[node] * spacing
+        return (
+            f"the anchor of width {width:.3g} at node {node} is too narrow for surface nodes at distances of "
+            f"{spacing:.3g}; use a mesh with nodes at most {width / NARROW:.3g} apart there, or a wider anchor"
+        )
+
+    def resolution(self, term: Term, mesh: Mesh, free: np.ndarray) -> dict[int, float]:
         ends, widths = term.nodes, np.zeros(term.nodes.shape)
         if term.params.width is not None:
             ends, widths = np.asarray(term.params.ends), np.asarray(term.params.width)
-        if (free[ends] & (widths == 0)).any():
-            return "a tendon pulls on a single node, where displacements grow without end; give its anchor a width"
+        found: dict[int, float] = {}
         for node, width in zip(ends[free[ends]].tolist(), widths[free[ends]].tolist(), strict=True):
-            if width < NARROW * (edge := longest_edge(mesh, node)):
-                return (
-                    f"the anchor of width {width:.3g} at node {node} is too narrow for the edges of the surface, of "
-                    f"length {edge:.3g}; use a mesh with edges of at most {width / NARROW:.3g} there, or a wider anchor"
-                )
-        return ""
+            share = width / node_spacing(mesh, node) if width else 0.0
+            found[node] = min(share, found.get(node, np.inf))
+        return found
 
     def measured(self, x: jax.Array, params: Any) -> dict[str, jax.Array]:
         return {"length": jax.vmap(self.length)(x, params), "tension": jax.vmap(self.tension)(x, params)}

@@ -35,7 +35,18 @@ from jaxbeam.scene.scene import Scene, check_scene
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
-from jaxbeam.study.doubt import SOFT, Softest, reads_corner, reads_load, scene_doubt, softest, squashed, takes_worst
+from jaxbeam.study.doubt import (
+    SOFT,
+    Softest,
+    reads_anchor,
+    reads_corner,
+    reads_load,
+    scene_doubt,
+    softest,
+    squashed,
+    takes_worst,
+    widening,
+)
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
 
@@ -232,11 +243,17 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
     left = change * element_of(scene.mesh.elements).shortfall
     reason = _doubt(scene, solution, change)
     if not reason:
-        reason = _doubt_of_state(scene, solution.x, finer, moved, own.slope, first.slope, measure)
-    bar = np.inf if reason else SAFETY * abs(left) + UNLIKE * cancelled + abs(algebraic)
-    # Positions after a Newton step may be inverted. Those that were carried over are not.
-    usable = np.isfinite(moved).all() and float(smallest_jacobian(finer, jnp.asarray(moved))) > 0
-    return ErrorEstimate(value, left, algebraic, bar, reason), finer, moved if usable else start
+        other = _value_and_slope(finer, squashed(finer, start), measure)[1]
+        reason = _doubt_of_state(scene, solution.x, finer, moved, own.slope, first.slope, other)
+    bar = np.inf if reason else widening(scene) * (SAFETY * abs(left) + UNLIKE * cancelled) + abs(algebraic)
+    return ErrorEstimate(value, left, algebraic, bar, reason), finer, _usable(finer, moved, start)
+
+
+def _usable(scene: Scene, moved: np.ndarray, carried: np.ndarray) -> np.ndarray:
+    """Positions `(n, 2)` to start a solve from: after Newton steps, unless these inverted an element; else carried over
+    from the coarser mesh, whose elements keep their `J`."""
+    sound = np.isfinite(moved).all() and float(smallest_jacobian(scene, jnp.asarray(moved))) > 0
+    return moved if sound else carried
 
 
 def _doubt(scene: Scene, solution: Solution, change: float) -> str:
@@ -248,12 +265,11 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
     return "" if np.isfinite(change) else "the finer mesh has no stable equilibrium near"
 
 
-def _doubt_of_state(
-    scene: Scene, x: Any, finer: Scene, moved: Any, slope: np.ndarray, finer_slope: np.ndarray, measure: Measure
-) -> str:
-    """Why the change to the finer mesh bounds no error, by the states and the derivatives of the measure on both."""
-    other = _value_and_slope(scene, squashed(scene, x), measure)[1]
-    point, corner, worst, soft = _state(scene, x, finer, moved, slope, finer_slope, other)
+def _doubt_of_state(scene: Scene, x: Any, finer: Scene, moved: Any, *slopes: Any) -> str:
+    """Why the change to the finer mesh bounds no error; empty if it does. Arguments as of `_state`."""
+    point, corner, worst, soft = _state(scene, x, finer, moved, *slopes)
+    if reads_anchor(scene, finer, *slopes[:2]):
+        return "the measure reads strains at an anchor that is narrower than the distance of nodes there"
     if point:
         return "the measure reads positions at the node of a point load, where displacements grow without end"
     if corner:
@@ -271,18 +287,21 @@ def _doubt_of_state(
 
 @jax.jit
 def _state(
-    scene: Scene,
-    x: jax.Array,
-    finer: Scene,
-    moved: jax.Array,
-    slope: jax.Array,
-    finer_slope: jax.Array,
-    other: jax.Array,
+    scene: Scene, x: jax.Array, finer: Scene, moved: jax.Array, slope: jax.Array, fine: jax.Array, other: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, Softest]:
-    """Whether the measure reads a point load, a corner, or the worst value; and the softest piece of the surface."""
-    point = reads_load(scene, finer, x, slope, finer_slope)
-    corner, worst = reads_corner(scene, finer, slope, finer_slope), takes_worst(scene, slope, other)
-    return point, corner, worst, softest(finer, moved)
+    """Whether the measure reads a point load, a corner, or the worst value; and the softest piece of the surface.
+
+    Args:
+        scene: on the coarser mesh.
+        x: `(n, 2)` its positions.
+        finer: on the finer mesh.
+        moved: `(N, 2)` its positions after the last Newton step.
+        slope: `(n, 2)` derivative of the measure in the positions on the coarser mesh.
+        fine: `(N, 2)` on the finer one.
+        other: `(N, 2)` on the finer one, at the `squashed` positions.
+    """
+    point = reads_load(scene, finer, x, slope, fine)
+    return point, reads_corner(scene, finer, slope, fine), takes_worst(finer, fine, other), softest(finer, moved)
 
 
 class _Change(NamedTuple):

@@ -44,6 +44,7 @@ SOFT = 0.2
 # mesh, and has the share `PART` of the largest. A measure spread over a length or an area keeps 0.3 to 0.7.
 KEPT = 0.8
 PART = 0.05
+STEEPER = 1.3
 # Share below which a derivative is round-off.
 NOISE = 1e-6
 # Sine of the turn of the surface, here 20 degrees, beyond which a hollow is a re-entrant corner.
@@ -59,6 +60,26 @@ def scene_doubt(scene: Scene) -> str:
     return next((reason for reason in reasons if reason), "")
 
 
+def resolution(scene: Scene) -> dict[int, float]:
+    """Of each anchor on a free node of a scene with concrete nodes: its width over the distance of nodes there."""
+    free = np.logical_not(scene.held.all(axis=1))
+    found: dict[int, float] = {}
+    for term in scene.terms:
+        for node, share in term.kind.resolution(term, scene.mesh, free).items():
+            found[node] = min(share, found.get(node, np.inf))
+    return found
+
+
+def widening(scene: Scene) -> float:
+    """Factor of the error bar for anchors that are narrower than the distance of nodes beside them; else 1.
+
+    Until the nodes are as close as the anchor is wide, each halving of their distance changes the answer by about the
+    same amount: displacements grow like the logarithm.
+    """
+    least = min(resolution(scene).values(), default=np.inf)
+    return 1 + max(0.0, -float(np.log2(least))) if least > 0 else np.inf
+
+
 # ---------------------------------------------------------------------------------- singular places
 
 
@@ -66,6 +87,8 @@ def corners(scene: Scene) -> np.ndarray:
     """Nodes `(n,)`, as booleans, where strains are infinite: ends of a clamp on the surface, and re-entrant corners of
     the body. The latter are known of concrete nodes only."""
     found, edges = np.zeros(len(scene.held), bool), scene.surface[:, :2]
+    if not len(edges):
+        return found
     held = scene.held[edges]
     ending = (held[:, 0] != held[:, 1]).any(axis=1)
     found[edges[ending][held[ending].any(axis=2)]] = True
@@ -109,6 +132,16 @@ def reads_load(scene: Scene, finer: Scene, x: jax.Array, slope: jax.Array, finer
     (near, _), (finer_near, finer_whole) = _slopes_at(loaded(scene, x), scene, finer, slope, finer_slope)
     # The work of the load counts too, whose derivative shows on the finer mesh alone.
     return (finer_near > PART * finer_whole) & (finer_near > KEPT * near)
+
+
+def reads_anchor(scene: Scene, finer: Scene, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
+    """Whether, `()`, a measure reads strains at an anchor that is narrower than the distance of nodes: they grow until
+    these are as close as the anchor is wide. Arguments as of `reads_corner`; outside `jit`."""
+    narrow = np.zeros(len(scene.held), bool)
+    narrow[[node for node, share in resolution(scene).items() if share < 1]] = True
+    (near, _), (finer_near, finer_whole) = _slopes_at(narrow, scene, finer, slope, finer_slope)
+    # Derivatives of a strain grow as elements shrink. Those of a displacement, as of the anchor's, do not.
+    return (finer_near > PART * finer_whole) & (finer_near > STEEPER * near)
 
 
 def _slopes_at(places: Any, *arguments: Any) -> list[tuple[jax.Array, jax.Array]]:
