@@ -7,7 +7,8 @@
    the mesh and the width; each has four scenes. Of every scene fourteen measures: the share of bars that hold, of
    infinite ones with their reasons, and the median of the bar over the error. The truth is a mesh of six-node triangles
    spaced in proportion to the distance from the clamp, the anchors and the faces. An error that is no larger than that
-   of the truth tells nothing. The constants of the bars were chosen with seed 1 and scenes drawn alike; judge them with another.
+   of the truth tells nothing. The constants were chosen with seed 1 and scenes drawn alike; judge them with
+   another seed.
 2. `solve_to` from 7 x 3 corners to a random tolerance: how often it is met in truth, on how fine a rung and in what
    time.
 """
