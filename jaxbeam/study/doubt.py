@@ -174,14 +174,16 @@ def takes_worst(scene: Scene, slope: jax.Array, other: jax.Array) -> jax.Array:
     Args:
         scene: of the state.
         slope: `(n, 2)` derivative of the measure in the positions.
-        other: `(n, 2)` its derivative at the `squashed` positions. If the measure leaves the place where it was for the
-            corner, it does not depend on that place any more.
+        other: `(n, 2)` its derivative at the `squashed` positions. If the measure left the place where it was for the
+            corner, it depends on no position beyond the elements that were squashed and their neighbours.
     """
-    found = corners(scene)
-    near = np.zeros(len(found), bool)
-    near[scene.mesh.elements[found[scene.mesh.elements].any(axis=1)]] = True
-    before, after = (jnp.max(jnp.abs(jnp.where(near[:, None], 0, each))) for each in (slope, other))
-    return jnp.asarray(found.any()) & (before > 0) & (after <= NOISE * before)
+    near, elements = corners(scene), scene.mesh.elements
+    some = jnp.asarray(near.any())
+    for _ in range(2):
+        near[elements[near[elements].any(axis=1)]] = True
+    beyond = jnp.max(jnp.abs(jnp.where(near[:, None], 0, other)))
+    before = jnp.max(jnp.abs(slope))
+    return some & (before > 0) & (beyond <= NOISE * before)
 
 
 # ------------------------------------------------------------------------------------------- creases
