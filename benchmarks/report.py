@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-PACKAGES = ("jaxbeam", "jax", "jaxlib", "numpy", "scipy", "simkit")
+PACKAGES = ("jaxbeam", "jax", "jaxlib", "numpy", "scipy", "simkit", "felupe")
 
 
 def options(description: str | None) -> argparse.ArgumentParser:
