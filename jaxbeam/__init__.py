@@ -105,6 +105,7 @@ from jaxbeam.study.corrected import corrected as corrected
 from jaxbeam.study.design import Design as Design
 from jaxbeam.study.design import DesignStatus as DesignStatus
 from jaxbeam.study.design import History as History
+from jaxbeam.study.doubt import Doubt as Doubt
 from jaxbeam.study.minimise import minimise as minimise
 from jaxbeam.study.model_doubt import model_doubt as model_doubt
 from jaxbeam.study.reach import reach as reach

@@ -67,6 +67,9 @@ class Element:
     enriched: the element of the same shape with more nodes that the error estimate uses; None: it uses the children.
     shortfall: ratio of the true error to the change that the finer elements make, measured by
         `benchmarks/accuracy.py`.
+    gains: what still finer elements would add to that change: shares of its part beside corners with infinite strains,
+        and of the rest; used by `jaxbeam.study.corrected`.
+    spread: bound of the error that is then left, as a share of the magnitudes of all parts of the change.
     """
 
     name: str
@@ -81,6 +84,7 @@ class Element:
     children: np.ndarray
     enriched: Element | None
     shortfall: float
+    gains: tuple[float, float]
     spread: float
 
     @property

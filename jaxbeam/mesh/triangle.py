@@ -109,7 +109,8 @@ QUADRATIC_TRIANGLE = Element(
     children=_FOUR,
     enriched=None,
     shortfall=1.5,
-    spread=0.35,
+    gains=(0.73, 0.1),
+    spread=0.25,
 )
 TRIANGLE = Element(
     name="triangle",
@@ -124,5 +125,6 @@ TRIANGLE = Element(
     children=_FOUR,
     enriched=QUADRATIC_TRIANGLE,
     shortfall=1.0,
-    spread=0.15,
+    gains=(0.4, 0.0),
+    spread=0.12,
 )

@@ -37,15 +37,16 @@ from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
 from jaxbeam.study.doubt import (
+    REASONS,
     SOFT,
+    Doubt,
+    Places,
     Softest,
-    reads_anchor,
-    reads_corner,
-    reads_load,
+    doubts,
+    places_of,
     scene_doubt,
     softest,
     squashed,
-    takes_worst,
     widening,
 )
 
@@ -244,8 +245,9 @@ def _estimate(scene: Scene, solution: Solution, measure: Measure, solver: Newton
     left = change * element_of(scene.mesh.elements).shortfall
     reason = _doubt(scene, solution, change)
     if not reason:
-        other = _value_and_slope(finer, squashed(finer, start), measure)[1]
-        reason = _doubt_of_state(scene, solution.x, finer, moved, own.slope, first.slope, other)
+        places = places_of(scene, finer)
+        other = _value_and_slope(finer, squashed(places.finer_corners, finer, start), measure)[1]
+        reason = _doubt_of_state(*_state(places, scene, solution.x, finer, moved, own.slope, first.slope, other))
     bar = np.inf if reason else widening(scene) * (SAFETY * abs(left) + UNLIKE * cancelled) + abs(algebraic)
     return ErrorEstimate(value, left, algebraic, bar, reason), finer, _usable(finer, moved, start)
 
@@ -266,43 +268,34 @@ def _doubt(scene: Scene, solution: Solution, change: float) -> str:
     return "" if np.isfinite(change) else "the finer mesh has no stable equilibrium near"
 
 
-def _doubt_of_state(scene: Scene, x: Any, finer: Scene, moved: Any, *slopes: Any) -> str:
-    """Why the change to the finer mesh bounds no error; empty if it does. Arguments as of `_state`."""
-    point, corner, worst, soft = _state(scene, x, finer, moved, *slopes)
-    if reads_anchor(scene, finer, *slopes[:2]):
-        return "the measure reads strains at an anchor that is narrower than the distance of nodes there"
-    if point:
-        return "the measure reads positions at the node of a point load, where displacements grow without end"
-    if corner:
-        return "the measure reads strains at an end of a clamp or a re-entrant corner, where they are infinite"
-    if worst:
-        return "the measure is the worst value in the body, and at an end of a clamp or a corner strains are infinite"
-    if soft.share < SOFT:
-        place = ", ".join(f"{value:.3g}" for value in soft.place)
-        return (
-            f"the surface may crease: at ({place}) it is compressed to {float(soft.stretch):.2f} of its length and has "
-            f"{max(float(soft.share), 0):.0%} of its stiffness left, and a finer mesh may give another answer"
-        )
-    return ""
+def _doubt_of_state(flags: jax.Array, soft: Softest) -> str:
+    """Why the change to the finer mesh bounds no error; empty if it does."""
+    for flag in Doubt(int(flags)):
+        return REASONS[flag]
+    if not soft.share < SOFT:
+        return ""
+    place = ", ".join(f"{value:.3g}" for value in soft.place)
+    return (
+        f"the surface may crease: at ({place}) it is compressed to {float(soft.stretch):.2f} of its length and has "
+        f"{max(float(soft.share), 0):.0%} of its stiffness left, and a finer mesh may give another answer"
+    )
 
 
 @jax.jit
 def _state(
-    scene: Scene, x: jax.Array, finer: Scene, moved: jax.Array, slope: jax.Array, fine: jax.Array, other: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, Softest]:
-    """Whether the measure reads a point load, a corner, or the worst value; and the softest piece of the surface.
-
-    Args:
-        scene: on the coarser mesh.
-        x: `(n, 2)` its positions.
-        finer: on the finer mesh.
-        moved: `(N, 2)` its positions after the last Newton step.
-        slope: `(n, 2)` derivative of the measure in the positions on the coarser mesh.
-        fine: `(N, 2)` on the finer one.
-        other: `(N, 2)` on the finer one, at the `squashed` positions.
-    """
-    point = reads_load(scene, finer, x, slope, fine)
-    return point, reads_corner(scene, finer, slope, fine), takes_worst(finer, fine, other), softest(finer, moved)
+    places: Places,
+    scene: Scene,
+    x: jax.Array,
+    finer: Scene,
+    moved: jax.Array,
+    slope: jax.Array,
+    fine: jax.Array,
+    other: jax.Array,
+) -> tuple[jax.Array, Softest]:
+    """Flags of what the measure reads (arguments as of `doubts`), and the softest piece of the surface at the positions
+    `moved` `(N, 2)` of the finer mesh."""
+    flags = doubts(places, scene, x, finer, slope, fine, other)
+    return flags, softest(places.finer_corners, finer, moved)
 
 
 class _Change(NamedTuple):

@@ -25,13 +25,14 @@ of that at rest.
 
 from __future__ import annotations
 
+import enum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.core.tree import is_concrete
+from jaxbeam.core.tree import index_field, pytree
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.measures import points_to_nodes
@@ -51,6 +52,86 @@ NOISE = 1e-6
 HOLLOW = 0.34
 # Number of angles of the means of the surface impedance. Their error falls exponentially with it.
 ANGLES = 32
+
+
+class Doubt(enum.IntFlag):
+    """Why no error bar is known, as flags that combine; `REASONS` has them in words.
+
+    NONE: one is known.
+    SCENE: a load acts on a point or on a very narrow anchor (see `scene_doubt`).
+    ANCHOR: the measure reads strains at an anchor that is narrower than the distance of nodes.
+    LOAD: the measure reads positions at a point load.
+    CORNER: the measure reads strains where they are infinite.
+    WORST: the measure is the worst value in the body.
+    CREASE: the surface may crease.
+    """
+
+    NONE = 0
+    SCENE = 1
+    ANCHOR = 2
+    LOAD = 4
+    CORNER = 8
+    WORST = 16
+    CREASE = 32
+
+
+REASONS = {
+    Doubt.SCENE: "a load acts on a point, or on an anchor that is narrow beside the elements",
+    Doubt.ANCHOR: "the measure reads strains at an anchor that is narrower than the distance of nodes there",
+    Doubt.LOAD: "the measure reads positions at the node of a point load, where displacements grow without end",
+    Doubt.CORNER: "the measure reads strains at an end of a clamp or a re-entrant corner, where they are infinite",
+    Doubt.WORST: "the measure is the worst value in the body, and strains at corners and ends of clamps are infinite",
+    Doubt.CREASE: "the surface may crease, and a finer mesh may give another answer",
+}
+
+
+@pytree
+class Places:
+    """Nodes of two meshes where an error bar may not be known; made by `places_of`.
+
+    corners: `(n,)` of the coarser mesh, as booleans: see `corners`.
+    finer_corners: `(N,)` of the finer mesh.
+    beside: `(N,)` nodes of the finer mesh that lie in elements of the coarser one at its corners.
+    narrow: `(n,)` anchors that are narrower than the distance of nodes beside them.
+    """
+
+    corners: np.ndarray = index_field()
+    finer_corners: np.ndarray = index_field()
+    beside: np.ndarray = index_field()
+    narrow: np.ndarray = index_field()
+
+
+def places_of(scene: Scene, finer: Scene) -> Places:
+    """The places of a scene and of the same on a finer mesh. The nodes must be concrete."""
+    narrow = np.zeros(len(scene.held), bool)
+    narrow[[node for node, share in resolution(scene).items() if share < 1]] = True
+    found, beside = corners(scene), np.zeros(len(finer.held), bool)
+    at_corner = found[scene.mesh.elements].any(axis=1)
+    beside[finer.mesh.elements[np.repeat(at_corner, len(finer.mesh.elements) // len(at_corner))]] = True
+    return Places(found, corners(finer), beside, narrow)
+
+
+def doubts(
+    places: Places, scene: Scene, x: jax.Array, finer: Scene, slope: jax.Array, fine: jax.Array, other: jax.Array
+) -> jax.Array:
+    """Flags `()` of what a measure reads: `ANCHOR`, `LOAD`, `CORNER` and `WORST`.
+
+    Args:
+        places: of both meshes.
+        scene: on the coarser mesh.
+        x: `(n, 2)` its positions.
+        finer: on the finer mesh, on which the nodes keep their numbers.
+        slope: `(n, 2)` derivative of the measure in the positions.
+        fine: `(N, 2)` on the finer mesh.
+        other: `(N, 2)` on the finer mesh, at the `squashed` positions.
+    """
+    found = {
+        Doubt.ANCHOR: reads_anchor(places, scene, finer, slope, fine),
+        Doubt.LOAD: reads_load(scene, finer, x, slope, fine),
+        Doubt.CORNER: reads_corner(places, scene, finer, slope, fine),
+        Doubt.WORST: takes_worst(places.finer_corners, finer, fine, other),
+    }
+    return sum((jnp.where(raised, int(flag), 0) for flag, raised in found.items()), jnp.zeros((), jnp.int32))
 
 
 def scene_doubt(scene: Scene) -> str:
@@ -85,20 +166,19 @@ def widening(scene: Scene) -> float:
 
 def corners(scene: Scene) -> np.ndarray:
     """Nodes `(n,)`, as booleans, where strains are infinite: ends of a clamp on the surface, and re-entrant corners of
-    the body. The latter are known of concrete nodes only."""
+    the body. The nodes must be concrete."""
     found, edges = np.zeros(len(scene.held), bool), scene.surface[:, :2]
     if not len(edges):
         return found
     held = scene.held[edges]
     ending = (held[:, 0] != held[:, 1]).any(axis=1)
     found[edges[ending][held[ending].any(axis=2)]] = True
-    if is_concrete(scene.mesh.nodes):
-        positions, before = np.asarray(scene.mesh.nodes), np.zeros((len(found), 2))
-        along = positions[edges[:, 1]] - positions[edges[:, 0]]
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        before[edges[:, 1]] = along
-        first = before[edges[:, 0]]
-        found[edges[first[:, 0] * along[:, 1] - first[:, 1] * along[:, 0] < -HOLLOW, 0]] = True
+    positions, before = np.asarray(scene.mesh.nodes), np.zeros((len(found), 2))
+    along = positions[edges[:, 1]] - positions[edges[:, 0]]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    before[edges[:, 1]] = along
+    first = before[edges[:, 0]]
+    found[edges[first[:, 0] * along[:, 1] - first[:, 1] * along[:, 0] < -HOLLOW, 0]] = True
     return found
 
 
@@ -112,34 +192,26 @@ def loaded(scene: Scene, x: jax.Array) -> jax.Array:
     return found & np.logical_not(scene.held.all(axis=1))
 
 
-def reads_corner(scene: Scene, finer: Scene, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
-    """Whether, `()`, a measure reads strains of the elements at `corners`, where it has no limit.
-
-    Args:
-        scene: on the coarser mesh.
-        finer: on the finer mesh, on which the nodes keep their numbers.
-        slope: `(n, 2)` derivative of the measure in the positions.
-        finer_slope: `(N, 2)` its derivative on the finer mesh.
-    """
-    (near, whole), (finer_near, finer_whole) = _slopes_at(corners(scene), scene, finer, slope, finer_slope)
+def reads_corner(places: Places, scene: Scene, finer: Scene, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
+    """Whether, `()`, a measure reads strains of the elements at corners, where it has no limit; arguments as of
+    `doubts`."""
+    (near, whole), (finer_near, finer_whole) = _slopes_at(places.corners, scene, finer, slope, finer_slope)
     # The energy is stationary: on the coarser mesh its derivative is round-off.
     counts = (near > PART * whole) & (near > NOISE * finer_whole)
     return counts & (finer_near > KEPT * near)
 
 
 def reads_load(scene: Scene, finer: Scene, x: jax.Array, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
-    """Whether, `()`, a measure reads positions at a point load, or near it strains. Arguments as of `reads_corner`."""
+    """Whether, `()`, a measure reads positions at a point load, or near it strains; arguments as of `doubts`."""
     (near, _), (finer_near, finer_whole) = _slopes_at(loaded(scene, x), scene, finer, slope, finer_slope)
     # The work of the load counts too, whose derivative shows on the finer mesh alone.
     return (finer_near > PART * finer_whole) & (finer_near > KEPT * near)
 
 
-def reads_anchor(scene: Scene, finer: Scene, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
+def reads_anchor(places: Places, scene: Scene, finer: Scene, slope: jax.Array, finer_slope: jax.Array) -> jax.Array:
     """Whether, `()`, a measure reads strains at an anchor that is narrower than the distance of nodes: they grow until
-    these are as close as the anchor is wide. Arguments as of `reads_corner`; outside `jit`."""
-    narrow = np.zeros(len(scene.held), bool)
-    narrow[[node for node, share in resolution(scene).items() if share < 1]] = True
-    (near, _), (finer_near, finer_whole) = _slopes_at(narrow, scene, finer, slope, finer_slope)
+    these are as close as the anchor is wide. Arguments as of `doubts`."""
+    (near, _), (finer_near, finer_whole) = _slopes_at(places.narrow, scene, finer, slope, finer_slope)
     # Derivatives of a strain grow as elements shrink. Those of a displacement, as of the anchor's, do not.
     return (finer_near > PART * finer_whole) & (finer_near > STEEPER * near)
 
@@ -157,27 +229,28 @@ def _slopes_at(places: Any, *arguments: Any) -> list[tuple[jax.Array, jax.Array]
     return found
 
 
-def squashed(scene: Scene, x: jax.Array) -> jax.Array:
-    """Positions `(n, 2)` at which the elements at `corners` are shrunk to a hundredth, which makes them the worst."""
-    found = corners(scene)
+def squashed(at: np.ndarray, scene: Scene, x: jax.Array) -> jax.Array:
+    """Positions `(n, 2)` at which the elements at the corners `at` `(n,)` are shrunk to a hundredth, which makes them
+    the worst."""
     # Each node moves towards the corner in its element, and held nodes stay.
-    near = np.argwhere(found[scene.mesh.elements])
-    towards = np.arange(len(found))
+    near = np.argwhere(at[scene.mesh.elements])
+    towards = np.arange(len(at))
     for element, place in near:
         towards[scene.mesh.elements[element]] = scene.mesh.elements[element, place]
     return jnp.where(scene.held, x, x[towards] + 0.01 * (x - x[towards]))
 
 
-def takes_worst(scene: Scene, slope: jax.Array, other: jax.Array) -> jax.Array:
+def takes_worst(at: np.ndarray, scene: Scene, slope: jax.Array, other: jax.Array) -> jax.Array:
     """Whether, `()`, a measure is the worst value in the body, which in the end lies at a corner.
 
     Args:
+        at: `(n,)` the corners, as booleans.
         scene: of the state.
         slope: `(n, 2)` derivative of the measure in the positions.
         other: `(n, 2)` its derivative at the `squashed` positions. If the measure left the place where it was for the
             corner, it depends on no position beyond the elements that were squashed and their neighbours.
     """
-    near, elements = corners(scene), scene.mesh.elements
+    near, elements = at.copy(), scene.mesh.elements
     some = jnp.asarray(near.any())
     for _ in range(2):
         near[elements[near[elements].any(axis=1)]] = True
@@ -203,9 +276,15 @@ class Softest(NamedTuple):
     place: jax.Array
 
 
-def softest(scene: Scene, x: jax.Array) -> Softest:
-    """The softest piece of the surface at positions `x` `(n, 2)`, as if no load acted on it. Runs under `jit`."""
-    apart = ~(scene.held.any(axis=1) | corners(scene))
+def softest(at: np.ndarray, scene: Scene, x: jax.Array) -> Softest:
+    """The softest piece of the surface at positions `x` `(n, 2)`, as if no load acted on it.
+
+    Args:
+        at: `(n,)` the corners, as booleans, near which no piece is looked at.
+        scene: of the state.
+        x: `(n, 2)` positions.
+    """
+    apart = ~(scene.held.any(axis=1) | at)
     found = [Softest(*(jnp.full(shape, jnp.inf, x.dtype) for shape in ((1,), (1,), (1, 2))))]
     for term in scene.terms:
         owners, sides = _at_surface(scene, term)

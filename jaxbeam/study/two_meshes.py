@@ -25,6 +25,7 @@ from jaxbeam.solve.equilibrium import solve_from
 from jaxbeam.solve.newton import Newton
 from jaxbeam.solve.solution import Solution, Status
 from jaxbeam.study.accuracy import enriched
+from jaxbeam.study.doubt import Places, places_of, scene_doubt, widening
 
 # Relative residuals at which the solves on the coarse and on the finer mesh end, unless the solver asks for a larger
 # one.
@@ -45,14 +46,18 @@ class TwoMeshes:
     fine: the same scene on the finer mesh.
     nodes: `(n, k)` for each finer node, numbers of the coarse nodes whose mean it is.
     weights: `(n, k)` their weights in the mean.
+    places: nodes at which a measure has no error bar.
     doubt: why no error bar is known, whatever the commands; empty if one is.
+    widening: factor of the error bars for narrow anchors.
     """
 
     coarse: Scene
     fine: Scene
     nodes: np.ndarray = index_field()
     weights: np.ndarray = index_field()
+    places: Places
     doubt: str = static_field(default="")
+    widening: float = static_field(default=1.0)
 
     def __repr__(self) -> str:
         return f"TwoMeshes({self.coarse!r}, {self.fine!r})"
@@ -80,9 +85,8 @@ def two_meshes(scene: Scene) -> TwoMeshes:
         ValueError: as `enriched` does, such as for a term that has no form on a finer mesh.
     """
     fine, way = enriched(scene)
-    free = np.logical_not(scene.held.all(axis=1))
-    doubts = [term.kind.without_limit(term, free) for term in scene.terms]
-    return TwoMeshes(scene, fine, way.nodes, way.weights, next(filter(None, doubts), ""))
+    places = places_of(scene, fine)
+    return TwoMeshes(scene, fine, way.nodes, way.weights, places, scene_doubt(scene), widening(scene))
 
 
 class States(NamedTuple):
