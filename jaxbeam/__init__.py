@@ -100,6 +100,8 @@ from jaxbeam.study.branch import Branch as Branch
 from jaxbeam.study.branch import Critical as Critical
 from jaxbeam.study.branch import trace_branch as trace_branch
 from jaxbeam.study.by_hand import euler_bernoulli as euler_bernoulli
+from jaxbeam.study.choice import Choice as Choice
+from jaxbeam.study.choice import choose as choose
 from jaxbeam.study.corrected import Corrected as Corrected
 from jaxbeam.study.corrected import corrected as corrected
 from jaxbeam.study.design import Design as Design

@@ -145,4 +145,6 @@ QUADRILATERAL = Element(
     children=_FOUR,
     enriched=None,
     shortfall=1.5,
+    gains=(0.73, 0.1),
+    spread=0.3,
 )

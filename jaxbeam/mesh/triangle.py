@@ -110,7 +110,7 @@ QUADRATIC_TRIANGLE = Element(
     enriched=None,
     shortfall=1.5,
     gains=(0.73, 0.1),
-    spread=0.25,
+    spread=0.3,
 )
 TRIANGLE = Element(
     name="triangle",
@@ -125,6 +125,6 @@ TRIANGLE = Element(
     children=_FOUR,
     enriched=QUADRATIC_TRIANGLE,
     shortfall=1.0,
-    gains=(0.4, 0.0),
+    gains=(0.0, 0.0),
     spread=0.12,
 )

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.physics.materials import POISSON
+from jaxbeam.scene.beams import rod_beam, tendon_beam
 from jaxbeam.scene.scene import Scene
 
 # Relative difference up to which a value counts as one that was measured.
@@ -70,6 +72,76 @@ AXES = {
     "stiffness": Axis("tendon_modulus / (young height^2)", (0.3125, 1.5625), 0),
     "width": Axis("anchor_width / height", (0.15625, 0.3125, 0.625), 1),
 }
+
+
+def _rod(anchor_width: float = 0.0, **description: Any) -> Scene:
+    """The rod beam of a description, whose anchors have no width."""
+    return rod_beam(9, **description)
+
+
+SIX = partial(tendon_beam, order=2, graded="proportional", diagonals="mirrored", anchor_width=0.25)
+TABLE = (
+    Row(
+        "a rod of 9 nodes",
+        _rod,
+        two_meshes=False,
+        time=0.45,
+        reference=5.0,
+        both=11.0,
+        slenderness=(7.2, 2.6, 6.4, 8.0),
+        poisson=(5.7, 3.0, 2.4),
+        stiffness=(2.5,),
+        width=(7.5, 2.8),
+    ),
+    Row(
+        "one mesh of six-node triangles, 9 x 5",
+        partial(SIX, 9, 5),
+        two_meshes=False,
+        time=1.2,
+        reference=0.83,
+        both=0.92,
+        slenderness=(2.1, 1.1, 0.98, 2.4),
+        poisson=(0.43, 1.7, 1.2),
+        stiffness=(1.1,),
+        width=(1.6, 0.81),
+    ),
+    Row(
+        "one mesh of six-node triangles, 11 x 5",
+        partial(SIX, 11, 5),
+        two_meshes=False,
+        time=1.4,
+        reference=0.61,
+        both=0.62,
+        slenderness=(1.6, 0.81, 0.68, 1.5),
+        poisson=(0.23, 1.5, 0.83),
+        stiffness=(0.73,),
+        width=(1.0, 0.63),
+    ),
+    Row(
+        "two meshes of six-node triangles, from 7 x 5",
+        partial(SIX, 7, 5),
+        two_meshes=True,
+        time=2.8,
+        reference=0.054,
+        both=0.12,
+        slenderness=(0.34, 0.1, 0.071, 0.1),
+        poisson=(0.046, 0.1, 0.18),
+        stiffness=(0.12,),
+        width=(0.46, 0.028),
+    ),
+    Row(
+        "two meshes of six-node triangles, from 13 x 7",
+        partial(SIX, 13, 7),
+        two_meshes=True,
+        time=6.8,
+        reference=0.0087,
+        both=0.025,
+        slenderness=(0.14, 0.036, 0.0056, 0.034),
+        poisson=(0.0052, 0.031, 0.049),
+        stiffness=(0.017,),
+        width=(0.063, 0.0073),
+    ),
+)
 
 
 class Choice(NamedTuple):

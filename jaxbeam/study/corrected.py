@@ -15,7 +15,7 @@ So the value is extrapolated with two gains (`Element.gains`), as in Richardson'
     value = f + gain_corner s + gain_rest (f - c - s)
 
 Many parts cancel in the change, but need not shrink alike. So the bar is a share, `Element.spread`, of the sum of their
-magnitudes.
+magnitudes and of what the change has beyond them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, compute_if, usual_rules, zeros_like_result
-from jaxbeam.core.tree import Numbers, is_concrete, replace, to_device, unlock
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.scene.evaluation import energy, smallest_jacobian, stencil_hessians
@@ -104,12 +104,12 @@ def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newt
         raise ValueError(f"ratios: expected shape (m,), or (B, m) with a row for each command, got {values.shape}")
     checked_commands("ratios", meshes.coarse, values if values.ndim == 1 else values[0])
     check_commands("ratios", meshes.coarse, values)
-    rows = to_device(values, meshes.coarse.mesh.nodes.dtype)
+    rows = namespace(values).asarray(values, meshes.coarse.mesh.nodes.dtype)
     layout_of = lambda scene: solver.linear.layout(topology(scene))
     layouts = layout_of(meshes.coarse), layout_of(meshes.fine)
     if is_concrete(rows, *jax.tree.leaves(meshes)):
         if rows.ndim == 2:
-            return _in_blocks(meshes, layouts, np.asarray(rows), measure, solver)
+            return _in_blocks(meshes, layouts, rows, measure, solver)
         states = solve_both(unlock(meshes), layouts, rows, solver)
         return _values(meshes, layouts, rows, states, measure, solver.linear)
 
@@ -140,16 +140,17 @@ def _corrected(
     at_coarse = attach_derivative(linear, meshes.coarse, layouts[0], states.coarse.x, None, good)
     fine, coarse = measure(meshes.fine, x), measure(meshes.coarse, at_coarse)
     parts = _parts(meshes, layouts[1], x, meshes.carry(at_coarse), states.factor, measure, linear)
-    gross, corner = (
-        each.reshape(fine.shape) for each in (jnp.sum(jnp.abs(parts), 0), jnp.sum(parts[places.beside], 0))
-    )
+    whole, corner = (jnp.sum(each, axis=0).reshape(fine.shape) for each in (parts, parts[places.beside]))
+    change = fine - coarse
+    # Of a measure that is stationary at equilibrium, such as the energy, all of the change is beyond first order.
+    gross = jnp.sum(jnp.abs(parts), axis=0).reshape(fine.shape) + jnp.abs(change - whole)
     known = lax.stop_gradient((meshes, at_coarse, x, meshes.carry(at_coarse)))
     slopes, doubt = _slopes_and_doubts(*known, measure)
     algebraic = jnp.abs(jnp.tensordot(slopes, states.step, 2)).reshape(fine.shape)
     bar = meshes.widening * element.spread * lax.stop_gradient(gross) + algebraic
     doubt = doubt.reshape(fine.shape)
     return Corrected(
-        value=fine + element.gains[0] * corner + element.gains[1] * (fine - coarse - corner),
+        value=fine + element.gains[0] * corner + element.gains[1] * (change - corner),
         bar=jnp.where(good & (doubt == 0), bar, jnp.inf).astype(fine.dtype),
         doubt=doubt,
         coarse=coarse,

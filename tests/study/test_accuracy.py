@@ -217,7 +217,7 @@ def test_solve_to_climbs_as_far_as_it_must(coarse):
     hard = jb.solve_to(scene, jb.tip_angle, 0.1)
     assert hard.met and hard.rung == 1 and hard.estimate.bar <= 0.1
     assert abs(hard.value - 10.142) <= hard.estimate.bar
-    assert int(hard.solution.steps) <= 4 < int(coarse[1].steps)
+    assert int(hard.solution.steps) < int(coarse[1].steps)
     never = jb.solve_to(scene, jb.tip_angle, 1e-9, most=100)
     assert not never.met and never.rung == 0 and never.estimate.bar > 1e-9
 
@@ -242,8 +242,10 @@ def test_nothing_is_certified_that_has_no_limit(coarse):
         jb.estimate_error(scene, solution, jb.tendon_tensions)
     with pytest.raises(ValueError, match="tolerance: expected a positive finite number"):
         jb.solve_to(scene, jb.tip_angle, 0.0)
-    with pytest.raises(ValueError, match="scene: expected concrete numbers"):
+    with pytest.raises(ValueError, match="scene: expected a mesh of known nodes"):
         jax.jit(lambda s: jb.enriched(s)[1].weights)(scene)
+    with pytest.raises(ValueError, match="inside jit use corrected"):
+        jax.jit(lambda s: jb.estimate_error(s, solution, jb.tip_angle).bar)(scene)
 
 
 # ----------------------------------------------------------------------------------------------- locking
