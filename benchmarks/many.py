@@ -4,7 +4,8 @@
 
 The sweep takes ratios (1 + d, 1 - d) with d in [-0.4, 0.4], each to a relative residual of 1e-9. In turn with it, in
 the same process: `lax.map` over `equilibrium` on every 16th of them. After them simkit ramps four of them in 28 steps
-each (see `benchmarks/simkit_peer.py`). Sweeps of 64 and of 4,096 asymmetries show whether a scene costs as much in a
+each (see `benchmarks/simkit_peer.py`). The same sweep by `corrected`, with an error bar on every answer, is set beside
+sweeps on each of its two meshes. Sweeps of 64 and of 4,096 asymmetries show whether a scene costs as much in a
 batch of any size. One thread, but for a table with all cores. Every answer of jaxbeam is verified by code that shares
 nothing with its solver.
 """
@@ -82,6 +83,24 @@ def sweeps(repeats: int) -> None:
     report.table(("", "ms a scene", "steps", "residual", "simkit over it", "lax.map over it"), lines)
 
 
+def with_bars(repeats: int) -> None:
+    """Print the time a scene of sweeps on two meshes with a bar on every answer, and of sweeps on each mesh alone."""
+    meshes = jb.two_meshes(
+        jb.tendon_beam(7, 5, order=2, graded="proportional", diagonals="mirrored", anchor_width=0.25)
+    )
+    rows = asymmetries(1024)
+    runs = {
+        "sweep on the coarse mesh, 7 x 5": lambda: jb.sweep(meshes.coarse, rows),
+        "sweep on the finer mesh": lambda: jb.sweep(meshes.fine, rows),
+        "corrected, with a bar on every answer": lambda: jb.corrected(meshes, rows, jb.tip_angle),
+    }
+    times = in_turn(*runs.values(), repeats=repeats)
+    bars = np.asarray(runs["corrected, with a bar on every answer"]().bar)
+    lines = [(name, 1e3 * own.median / len(rows), own.over(times[1])) for name, own in zip(runs, times, strict=True)]
+    report.table(("", "ms a scene", "over the finer sweep"), lines)
+    print(f"finite bars: {np.isfinite(bars).sum()} of {len(rows)}")
+
+
 def threads(repeats: int) -> tuple[float, float, float]:
     """Seconds of the sweep on one core and on all, in turn, where XLA may use them, and the gain."""
     scene, rows = jb.tendon_beam(), asymmetries(1024)
@@ -106,6 +125,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="timed calls of each")
     options = parser.parse_args()
     report.head("Many scenes")
+    with_bars(options.repeats)
     sweeps(options.repeats)
     report.table(("", "one thread, s", f"{CORES} threads", "gain"), [("sweep", *threads_apart(options.repeats))])
 

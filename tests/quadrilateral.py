@@ -146,5 +146,5 @@ QUADRILATERAL = Element(
     enriched=None,
     shortfall=1.5,
     gains=(0.73, 0.1),
-    spread=0.3,
+    spread=0.33,
 )

@@ -69,7 +69,7 @@ class Element:
         `benchmarks/accuracy.py`.
     gains: what still finer elements would add to that change: shares of its part beside corners with infinite strains,
         and of the rest; used by `jaxbeam.study.corrected`.
-    spread: bound of the error that is then left, as a share of the magnitudes of all parts of the change.
+    spread: bound of the error that is then left, as a share of the magnitudes of the parts of each element.
     """
 
     name: str

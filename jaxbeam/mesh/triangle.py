@@ -110,7 +110,7 @@ QUADRATIC_TRIANGLE = Element(
     enriched=None,
     shortfall=1.5,
     gains=(0.73, 0.1),
-    spread=0.3,
+    spread=0.33,
 )
 TRIANGLE = Element(
     name="triangle",

@@ -14,8 +14,9 @@ So the value is extrapolated with two gains (`Element.gains`), as in Richardson'
 
     value = f + gain_corner s + gain_rest (f - c - s)
 
-Many parts cancel in the change, but need not shrink alike. So the bar is a share, `Element.spread`, of the sum of their
-magnitudes and of what the change has beyond them.
+Parts of different elements may cancel in the change, but need not shrink alike. So the bar is a share,
+`Element.spread`, of the sum of the magnitudes of the parts of each coarse element, and of what the change has beyond
+the parts.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def _corrected(
     whole, corner = (jnp.sum(each, axis=0).reshape(fine.shape) for each in (parts, parts[places.beside]))
     change = fine - coarse
     # Of a measure that is stationary at equilibrium, such as the energy, all of the change is beyond first order.
-    gross = jnp.sum(jnp.abs(parts), axis=0).reshape(fine.shape) + jnp.abs(change - whole)
+    gross = jnp.sum(jnp.abs(meshes.by_element(parts)), axis=0).reshape(fine.shape) + jnp.abs(change - whole)
     known = lax.stop_gradient((meshes, at_coarse, x, meshes.carry(at_coarse)))
     slopes, doubt = _slopes_and_doubts(*known, measure)
     algebraic = jnp.abs(jnp.tensordot(slopes, states.step, 2)).reshape(fine.shape)

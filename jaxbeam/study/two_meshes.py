@@ -46,6 +46,7 @@ class TwoMeshes:
     fine: the same scene on the finer mesh.
     nodes: `(n, k)` for each finer node, numbers of the coarse nodes whose mean it is.
     weights: `(n, k)` their weights in the mean.
+    members: `(t, j)` the finer nodes in each coarse element.
     places: nodes at which a measure has no error bar.
     doubt: why no error bar is known, whatever the commands; empty if one is.
     widening: factor of the error bars for narrow anchors.
@@ -55,6 +56,7 @@ class TwoMeshes:
     fine: Scene
     nodes: np.ndarray = index_field()
     weights: np.ndarray = index_field()
+    members: np.ndarray = index_field()
     places: Places
     doubt: str = static_field(default="")
     widening: float = static_field(default=1.0)
@@ -65,6 +67,11 @@ class TwoMeshes:
     def carry(self, field: jax.Array) -> jax.Array:
         """A field `(m, d)` at the nodes of the coarse mesh, at those of the finer one `(n, d)`."""
         return jnp.einsum("nk,nkd->nd", jnp.asarray(self.weights, field.dtype), field[self.nodes])
+
+    def by_element(self, parts: jax.Array) -> jax.Array:
+        """Values `(n, p)` at the nodes of the finer mesh, shared out among the coarse elements `(t, p)` around each."""
+        around = np.bincount(np.asarray(self.members).ravel())[:, None]
+        return jnp.sum((parts / around)[self.members], axis=1)
 
     def commanded(self, ratios: jax.Array) -> TwoMeshes:
         """Both scenes under the commands `ratios` `(m,)`."""
@@ -85,8 +92,10 @@ def two_meshes(scene: Scene) -> TwoMeshes:
         ValueError: as `enriched` does, such as for a term that has no form on a finer mesh.
     """
     fine, way = enriched(scene)
+    whole = fine.mesh.elements.reshape(len(scene.mesh.elements), -1)
+    members = np.array([np.unique(nodes) for nodes in whole])
     places = places_of(scene, fine)
-    return TwoMeshes(scene, fine, way.nodes, way.weights, places, scene_doubt(scene), widening(scene))
+    return TwoMeshes(scene, fine, way.nodes, way.weights, members, places, scene_doubt(scene), widening(scene))
 
 
 class States(NamedTuple):
