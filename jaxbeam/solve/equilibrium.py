@@ -71,8 +71,8 @@ def linear_response(scene: Scene, linear: LinearSolver = BlockTridiagonal()) -> 
 
     The energy of all terms, tendons included, is expanded to second order about rest, so displacements are proportional
     to small commands and loads. The result is cheap, and exact for small ones. For larger ones it does not tell how
-    wrong it is: on the reference scene it bends too little by 7 % at a ratio of 0.95 and by a quarter at 0.8, where the
-    hand calculation (`euler_bernoulli`) is right to 0.3 %.
+    wrong it is: on the reference beam with its top tendon pulled to 0.95, 0.8, 0.65 and 0.5 the angle is 7, 24, 36 and
+    37 % too small, and the tension 3, 13, 30 and 67 % too large.
 
     Args:
         scene: what to solve.
