@@ -3,8 +3,9 @@
 The top tendon is pulled to 0.8 of its length, its free end spread over the surface within 0.25, so that there is an
 answer to converge to. Every way to solve is timed, after compiling, and set against a fine mesh: the error is that of
 the tip angle or of the tension, the larger of the two. Meshes come with an error bar, which knows nothing of that
-answer: `jb.estimate_error` for one mesh, `jb.corrected` for two. Triangles have six nodes unless said otherwise. At last `jb.choose` names the cheapest way for an
-error, and `jb.solve_to` refines until the angle is known to a hundredth of a degree.
+answer: `jb.estimate_error` for one mesh, `jb.corrected` for two. Triangles have six nodes unless said otherwise. At
+last `jb.choose` names the cheapest way for an error, and `jb.solve_to` refines until the angle is known to a hundredth
+of a degree.
 """
 
 import argparse

@@ -90,6 +90,38 @@ def test_a_failed_solve_has_no_bar_and_spoils_no_other():
     assert np.all(np.isfinite(slope[0])) and np.all(slope[1] == 0)
 
 
+@pytest.mark.slow
+def test_other_kinds_of_physics():
+    """Weight and contact, and a cable through a guide in small units, against a mesh twice as fine as the finer one."""
+    for scene, ratios in (leaning(), guided()):
+        meshes = jb.two_meshes(scene)
+        found = jb.corrected(meshes, ratios, jb.tip_angle)
+        jb.check(found.solution)
+        finest = jb.command(jb.enriched(meshes.fine)[0], ratios)
+        exact = jb.tip_angle(finest, jb.check(jb.equilibrium(finest)).x)
+        assert abs(found.value - exact) < found.bar < 0.1 * abs(exact)
+        assert abs(found.value - exact) < 0.2 * abs(found.coarse - exact)
+
+
+def leaning() -> tuple[jb.Scene, list[float]]:
+    """A cantilever under its weight, whose tip lies on a half-plane."""
+    mesh = jb.rectangle(3.5, 0.8, 15, 5, order=2)
+    left, right = (jb.nodes_where(mesh, lambda x, y, s=s: s * x > 1.74) for s in (-1, 1))
+    lower = jb.nodes_where(mesh, lambda x, y: y < -0.399)
+    floor = jb.contact(mesh, lower, jb.half_plane([0.0, -0.6], [0.0, 1.0]), 1e5, 0.01)
+    terms = jb.solid(mesh, jb.lame(1e4, 0.45)), jb.weight(mesh, [0.0, -14.0]), floor
+    return jb.Scene(mesh, terms, jb.clamped(mesh, left), right), [0.0]
+
+
+def guided() -> tuple[jb.Scene, list[float]]:
+    """A cantilever of 35 mm, in metres, with a cable through a guide."""
+    mesh = jb.rectangle(0.035, 0.008, 15, 5, "crossed")
+    left, right = (jb.nodes_where(mesh, lambda x, y, s=s: s * x > 0.0174) for s in (-1, 1))
+    line = [jb.nearest_node(mesh, [x, 0.004]) for x in (-0.0175, 0.0, 0.0125)]
+    cable = jb.cables(mesh, [line], 40.0, width=np.array([[0.0, 0.0025, 0.0025]]))
+    return jb.Scene(mesh, (jb.solid(mesh, jb.lame(1e6, 0.45)), cable), jb.clamped(mesh, left), right), [0.8]
+
+
 def test_point_anchors_have_no_bar():
     meshes = jb.two_meshes(jb.tendon_beam(7, 3))
     assert "single node" in meshes.doubt
