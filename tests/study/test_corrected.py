@@ -80,13 +80,20 @@ def test_many_commands_inside_jit():
     assert np.isclose(jnp.sum(mapped), loss(rows), rtol=1e-5)
 
 
-def test_a_failed_solve_has_no_bar_and_spoils_no_other():
-    meshes = jb.two_meshes(CROSSED())
-    found = jb.corrected(meshes, [[0.9, 1.0], [0.02, 0.02]], jb.tip_angle, jb.Newton(max_steps=12))
-    assert found.solution.status[0] == 0 and np.isfinite(found.bar[0])
-    assert found.solution.status[1] & jb.Status.NOT_CONVERGED and np.isinf(found.bar[1])
-    loss = lambda rows: jb.corrected(meshes, rows, jb.tip_angle, jb.Newton(max_steps=12)).value
-    slope = jax.grad(lambda rows: loss(rows)[0])(jnp.array([[0.9, 1.0], [0.02, 0.02]]))
+FEW = jb.Newton(max_steps=12)
+
+
+def test_a_failed_solve_has_no_bar():
+    found = jb.corrected(jb.two_meshes(CROSSED()), [0.02, 0.02], jb.tip_angle, FEW)
+    assert found.solution.status & jb.Status.NOT_CONVERGED and np.isinf(found.bar)
+
+
+@pytest.mark.slow
+def test_a_failed_solve_spoils_no_other():
+    meshes, rows = jb.two_meshes(CROSSED()), jnp.array([[0.9, 1.0], [0.02, 0.02]])
+    found = jb.corrected(meshes, rows, jb.tip_angle, FEW)
+    assert found.solution.status[0] == 0 and np.isfinite(found.bar[0]) and np.isinf(found.bar[1])
+    slope = jax.grad(lambda rows: jb.corrected(meshes, rows, jb.tip_angle, FEW).value[0])(rows)
     assert np.all(np.isfinite(slope[0])) and np.all(slope[1] == 0)
 
 
