@@ -25,7 +25,7 @@ from jax.sharding import PartitionSpec
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
-from jaxbeam.core.tree import Numbers, is_concrete, to_device, unlock
+from jaxbeam.core.tree import Numbers, T, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
 from jaxbeam.scene.evaluation import energy
 from jaxbeam.scene.rigid import check_held
@@ -349,7 +349,7 @@ def _on_all_cores(
             results += found
             if progress is not None:
                 progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
-    return _assembled(parts, results if processes == 1 else _gathered(results, len(parts)))
+    return assembled(parts, results if processes == 1 else _gathered(results, len(parts)))
 
 
 def _gathered(mine: list[Solution], count: int) -> list[Solution]:
@@ -364,8 +364,8 @@ def _gathered(mine: list[Solution], count: int) -> list[Solution]:
     return [jax.tree.map(lambda leaf, k=k: leaf[k % processes, k // processes], everyone) for k in range(count)]
 
 
-def _assembled(parts: list[np.ndarray], results: list[Solution]) -> Solution:
-    """The solutions of all parts, in the order of the commands that were passed."""
+def assembled(parts: list[np.ndarray], results: list[T]) -> T:
+    """The results of all parts, each padded to the same length, in the order of the commands that were passed."""
     order = np.argsort(np.concatenate(parts))
     join = lambda *leaves: to_device(
         np.concatenate([leaf[: len(part)] for leaf, part in zip(leaves, parts, strict=True)])[order]

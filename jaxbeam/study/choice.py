@@ -17,6 +17,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.physics.materials import POISSON
 from jaxbeam.scene.beams import rod_beam, tendon_beam
 from jaxbeam.scene.scene import Scene
+from jaxbeam.study.model_doubt import beyond
 
 # Relative difference up to which a value counts as one that was measured.
 NEAR = 1e-6
@@ -206,9 +207,7 @@ def choose(
         "width": anchor_width / height,
     }
     outside = [
-        f"{axis.name} {asked[key]:.4g} (measured from {axis.values[0]:g} to {axis.values[-1]:g})"
-        for key, axis in AXES.items()
-        if not axis.values[0] * (1 - NEAR) <= asked[key] <= axis.values[-1] * (1 + NEAR)
+        words for key, axis in AXES.items() for words in beyond(axis.name, asked[key], axis.values[0], axis.values[-1])
     ]
     doubt = f"outside of what was measured: {'; '.join(outside)}" if outside else ""
     expected = [(_expected(row, asked, both), row) for row in TABLE]

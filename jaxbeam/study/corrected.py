@@ -34,7 +34,7 @@ from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, compute_if, usual_rules, zeros_like_result
-from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device, unlock
+from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.scene.evaluation import energy, smallest_jacobian, stencil_hessians
@@ -43,14 +43,14 @@ from jaxbeam.scene.scene import Scene, check_commands, checked_commands, command
 from jaxbeam.solve.implicit import attach_derivative, energy_gradient
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.solution import Solution
-from jaxbeam.solve.sweep import partition, sweep
+from jaxbeam.solve.sweep import assembled, partition, sweep
 from jaxbeam.study.doubt import SOFT, Doubt, doubts, softest, squashed
 from jaxbeam.study.two_meshes import States, TwoMeshes, solve_both
 
 Measure = Callable[[Scene, jax.Array], jax.Array]
 
-# Number of neighbouring commands in a block of a sweep. Their bars may share a factor of the finer stiffness if no node
-# lies farther from its place in the state of the factor than this share of the body.
+# Number of neighbouring commands in a block of a sweep. Their adjoints may share a factor of the finer stiffness if no
+# node lies farther from its place in the state of the factor than this share of the body.
 BLOCK = 64
 NEAR = 0.01
 
@@ -65,7 +65,8 @@ class Corrected(NamedTuple):
     fine: `(...)` the measure on the finer mesh.
     algebraic: `(...)` by how much the last step changed it, which bounds what the solver leaves; part of `bar`.
     steps: `(2,)` Newton steps on the coarse and on the finer mesh.
-    solution: on the finer mesh; its `status` has the flags of both meshes.
+    solution: on the finer mesh; its `status` has the flags of both meshes. Residual and correction are those before the
+        last steps, which reuse a factor.
     """
 
     value: jax.Array
@@ -140,16 +141,16 @@ def _corrected(
     x = attach_derivative(linear, meshes.fine, layouts[1], states.fine.x, None, good)
     at_coarse = attach_derivative(linear, meshes.coarse, layouts[0], states.coarse.x, None, good)
     fine, coarse = measure(meshes.fine, x), measure(meshes.coarse, at_coarse)
-    parts = _parts(meshes, layouts[1], x, meshes.carry(at_coarse), states.factor, measure, linear)
+    start, slopes = meshes.carry(at_coarse), _slopes(meshes.fine, x, measure)
+    parts = _parts(meshes, layouts[1], x, start, states.factor, slopes, linear)
     whole, corner = (jnp.sum(each, axis=0).reshape(fine.shape) for each in (parts, parts[places.beside]))
     change = fine - coarse
     # Of a measure that is stationary at equilibrium, such as the energy, all of the change is beyond first order.
     gross = jnp.sum(jnp.abs(meshes.by_element(parts)), axis=0).reshape(fine.shape) + jnp.abs(change - whole)
-    known = lax.stop_gradient((meshes, at_coarse, x, meshes.carry(at_coarse)))
-    slopes, doubt = _slopes_and_doubts(*known, measure)
+    still, at, there, begin, slopes = lax.stop_gradient((meshes, at_coarse, x, start, slopes))
+    doubt = _doubts(still, at, there, begin, slopes, measure).reshape(fine.shape)
     algebraic = jnp.abs(jnp.tensordot(slopes, states.step, 2)).reshape(fine.shape)
     bar = meshes.widening * element.spread * lax.stop_gradient(gross) + algebraic
-    doubt = doubt.reshape(fine.shape)
     return Corrected(
         value=fine + element.gains[0] * corner + element.gains[1] * (change - corner),
         bar=jnp.where(good & (doubt == 0), bar, jnp.inf).astype(fine.dtype),
@@ -179,7 +180,7 @@ def _parts(
     x: jax.Array,
     start: jax.Array,
     factor: Any,
-    measure: Measure,
+    slopes: jax.Array,
     linear: LinearSolver,
 ) -> jax.Array:
     """The parts `(n, p)` of the change of `p` measures at the nodes of the finer mesh; differentiable.
@@ -190,7 +191,7 @@ def _parts(
         x: `(n, d)` positions on the finer mesh.
         start: `(n, d)` the coarse positions, carried over.
         factor: of the stiffness near `x`; None: it is made at `x`.
-        measure: of `p` components.
+        slopes: `(p, n, d)` derivatives of the measures at `x`.
         linear: the linear solver.
     """
     scene, count = meshes.fine, meshes.coarse.mesh.nodes.shape[0]
@@ -210,20 +211,19 @@ def _parts(
         return -jnp.sum((adjoint - meshes.carry(adjoint[:count])) * unbalanced, axis=1)
 
     unbalanced = jnp.where(scene.held, 0, energy_gradient(scene, start))
-    return jnp.stack([part(slope) for slope in _slopes(scene, x, measure)], axis=1)
+    return jnp.stack([part(slope) for slope in slopes], axis=1)
 
 
-def _slopes_and_doubts(
-    meshes: TwoMeshes, at_coarse: jax.Array, x: jax.Array, start: jax.Array, measure: Measure
-) -> tuple[jax.Array, jax.Array]:
-    """The derivatives `(p, n, d)` of the measures on the finer mesh, and the flags `(p,)` of their doubts."""
+def _doubts(
+    meshes: TwoMeshes, at_coarse: jax.Array, x: jax.Array, start: jax.Array, slopes: jax.Array, measure: Measure
+) -> jax.Array:
+    """Flags `(p,)` of the doubts about each measure, whose derivatives on the finer mesh are `slopes` `(p, n, d)`."""
     scene, places = meshes.fine, meshes.places
-    slopes = _slopes(scene, x, measure)
     others = _slopes(scene, squashed(places.finer_corners, scene, start), measure)
     reads = jax.vmap(partial(doubts, places, meshes.coarse, at_coarse, scene))
     flags = reads(_slopes(meshes.coarse, at_coarse, measure), slopes, others) | int(Doubt.SCENE if meshes.doubt else 0)
     soft = softest(places.finer_corners, scene, x).share < SOFT
-    return slopes, flags | jnp.where(soft, int(Doubt.CREASE), 0).astype(flags.dtype)
+    return flags | jnp.where(soft, int(Doubt.CREASE), 0).astype(flags.dtype)
 
 
 # ------------------------------------------------------------------------------------------------ many commands
@@ -241,7 +241,8 @@ def _block(
 ) -> Corrected:
     """The results for a block of commands `rows` `(C, m)`, whose solutions on both meshes are known.
 
-    A factor serves the adjoints of all states within `NEAR` of its own. They enter the bars alone.
+    A factor serves the adjoints of all states within `NEAR` of its own. They enter the bars, and of the values the
+    small correction at corners.
     """
     size = extent(meshes.fine)
 
@@ -271,12 +272,10 @@ def _in_blocks(
     def solve(part: np.ndarray) -> Corrected:
         padded = np.resize(part, BLOCK)
         known = jax.tree.map(lambda leaf: leaf[padded], solutions)
-        found = _block(meshes, layouts, rows[padded], *known, measure, solver.linear)
-        return jax.device_get(jax.tree.map(lambda leaf: leaf[: len(part)], found))
+        return jax.device_get(_block(meshes, layouts, rows[padded], *known, measure, solver.linear))
 
     # The first block compiles the program; otherwise each thread would compile it.
     results = [solve(parts[0])]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         results += pool.map(solve, parts[1:])
-    order = np.argsort(np.concatenate(parts))
-    return jax.tree.map(lambda *leaves: to_device(np.concatenate(leaves)[order]), *results)
+    return assembled(parts, results)

@@ -107,7 +107,7 @@ def places_of(scene: Scene, finer: Scene) -> Places:
     narrow[[node for node, share in resolution(scene).items() if share < 1]] = True
     found, beside = corners(scene), np.zeros(len(finer.held), bool)
     at_corner = found[scene.mesh.elements].any(axis=1)
-    beside[finer.mesh.elements[np.repeat(at_corner, len(finer.mesh.elements) // len(at_corner))]] = True
+    beside[finer.mesh.elements.reshape(len(at_corner), -1)[at_corner]] = True
     return Places(found, corners(finer), beside, narrow)
 
 

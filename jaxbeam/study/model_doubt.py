@@ -74,11 +74,15 @@ def outside(measured: Measured, ratios: Any, slenderness: Any, poisson: Any, sti
         ("Poisson's ratio", poisson, measured.poisson),
         ("stiffness of the tendons, k a^2 / (E H^2),", stiffness, measured.stiffness),
     ):
-        flat = np.ravel(np.asarray(values, float))
-        off = flat[~((flat >= low - NEAR) & (flat <= high + NEAR))]
-        if off.size:
-            found.append(f"{name} {off[0]:.4g} (known from {low} to {high})")
+        found += beyond(name, values, low, high)
     return f"the error is not known to stay below {measured.error} %: {'; '.join(found)}" if found else ""
+
+
+def beyond(name: str, values: Any, low: float, high: float) -> list[str]:
+    """The first of some figures that lies outside a range, in words; empty if none does."""
+    flat = np.ravel(np.asarray(values, float))
+    off = flat[~((flat >= low - NEAR) & (flat <= high + NEAR))]
+    return [f"{name} {off[0]:.4g} (known from {low} to {high})"] if off.size else []
 
 
 def model_doubt(scene: Scene) -> str:

@@ -18,7 +18,7 @@ from jax import lax
 from jaxbeam.core.compiling import compiled, usual_rules
 from jaxbeam.core.tree import index_field, pytree, replace, static_field
 from jaxbeam.linear.layout import Layout, expand, gather
-from jaxbeam.scene.evaluation import energy, evaluate, smallest_jacobian
+from jaxbeam.scene.evaluation import evaluate, smallest_jacobian
 from jaxbeam.scene.scene import Scene, at_places, command
 from jaxbeam.solve.actuation import from_rest
 from jaxbeam.solve.equilibrium import solve_from
@@ -102,7 +102,7 @@ class States(NamedTuple):
     """Equilibria on both meshes.
 
     coarse: solution on the coarse mesh.
-    fine: solution on the finer mesh, after the short steps; `status` has the flags of both.
+    fine: solution on the finer mesh; `x` is that after the short steps, and `status` has the flags of both.
     start: `(n, d)` the coarse positions, carried over.
     step: `(n, d)` the last short step; `fine.x` includes it.
     factor: of the stiffness on the finer mesh at a state near `fine.x`.
@@ -179,5 +179,4 @@ def _settled(
         for fails, flag in ((~converged, Status.NOT_CONVERGED), (~(volume > 0), Status.INVERTED))
     )
     status = (coarse.status | fine.status | unsettled | inverted).astype(jnp.int32)
-    found = replace(fine, x=x, energy=energy(scene, x), smallest_jacobian=volume, status=status)
-    return States(coarse, found, start, step, factor)
+    return States(coarse, replace(fine, x=x, status=status), start, step, factor)
