@@ -63,7 +63,6 @@ from jaxbeam.scene.measures import contact_forces as contact_forces
 from jaxbeam.scene.measures import contact_pressures as contact_pressures
 from jaxbeam.scene.measures import guide_forces as guide_forces
 from jaxbeam.scene.measures import jacobians as jacobians
-from jaxbeam.scene.measures import nodal_stress as nodal_stress
 from jaxbeam.scene.measures import penetration as penetration
 from jaxbeam.scene.measures import section_rotation as section_rotation
 from jaxbeam.scene.measures import strain_energy as strain_energy
@@ -72,6 +71,9 @@ from jaxbeam.scene.measures import tendon_slack as tendon_slack
 from jaxbeam.scene.measures import tendon_tensions as tendon_tensions
 from jaxbeam.scene.measures import tip_angle as tip_angle
 from jaxbeam.scene.measures import tip_position as tip_position
+from jaxbeam.scene.nodal import nodal_stress as nodal_stress
+from jaxbeam.scene.nodal import nodal_von_mises_stress as nodal_von_mises_stress
+from jaxbeam.scene.nodal import to_nodes as to_nodes
 from jaxbeam.scene.points import Marker as Marker
 from jaxbeam.scene.points import curvature as curvature
 from jaxbeam.scene.points import marker as marker
@@ -80,6 +82,7 @@ from jaxbeam.scene.scene import clamped as clamped
 from jaxbeam.scene.scene import command as command
 from jaxbeam.scene.stress import out_of_plane_stress as out_of_plane_stress
 from jaxbeam.scene.stress import principal_stretches as principal_stretches
+from jaxbeam.scene.stress import strain_energy_density as strain_energy_density
 from jaxbeam.scene.stress import von_mises_stress as von_mises_stress
 from jaxbeam.solve.equilibrium import equilibrium as equilibrium
 from jaxbeam.solve.equilibrium import linear_response as linear_response

@@ -22,7 +22,8 @@ from jaxbeam.files.groups import PREFIX
 from jaxbeam.files.states import check_solution, each_state
 from jaxbeam.mesh.mesh import Mesh
 from jaxbeam.physics.energy import Term, check_nodes
-from jaxbeam.scene.measures import jacobians, nodal_stress, strain_energy
+from jaxbeam.scene.measures import jacobians, strain_energy
+from jaxbeam.scene.nodal import nodal_stress
 from jaxbeam.scene.scene import Scene, placed
 from jaxbeam.solve.solution import Solution
 

@@ -21,10 +21,13 @@ from jaxbeam.plot.animations import animate_ramp as animate_ramp
 from jaxbeam.plot.animations import save_animation as save_animation
 from jaxbeam.plot.drawing import MARKERS as MARKERS
 from jaxbeam.plot.drawing import PALETTE as PALETTE
+from jaxbeam.plot.drawing import Limits as Limits
 from jaxbeam.plot.drawing import limits as limits
+from jaxbeam.plot.fields import Field as Field
+from jaxbeam.plot.picture import Picture as Picture
+from jaxbeam.plot.picture import beam as beam
+from jaxbeam.plot.picture import field as field
 from jaxbeam.plot.states import States as States
-from jaxbeam.plot.stills import beam as beam
 from jaxbeam.plot.stills import branches as branches
 from jaxbeam.plot.stills import curves as curves
-from jaxbeam.plot.stills import field as field
 from jaxbeam.plot.stills import gallery as gallery

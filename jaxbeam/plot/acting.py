@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.core.tree import Numbers
 from jaxbeam.mesh.element import edge_functions, edge_slopes
 from jaxbeam.mesh.surface import CORNER
 from jaxbeam.physics.energy import Term
@@ -45,13 +44,17 @@ class Row(NamedTuple):
     xi: np.ndarray
 
 
-class Forces(NamedTuple):
-    """Forces in one state: on points, and in rows.
+class Acted(NamedTuple):
+    """One state of a picture: where the body is, and what acts on it.
 
-    at, force: `(q, 2)` each.
+    scene: under the commands of this state.
+    x: `(n, d)` positions.
+    at, force: `(q, 2)` each: the forces on points.
     rows: for each row the points, the forces per length and the outward normals, `(r, 2)` each.
     """
 
+    scene: Scene
+    x: np.ndarray
     at: np.ndarray
     force: np.ndarray
     rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -60,34 +63,52 @@ class Forces(NamedTuple):
 class Acting:
     """What acts on a body in the states of a picture: arrows, springs and obstacles.
 
+    Show each state to `see` before it is drawn. Arrows then have one scale, and springs one base, for all states that
+    were seen. A state that is seen later can only make the arrows shorter.
+
     Args:
         scene: of the body.
-        x: `(s, n, d)` positions in each state.
-        commands: `(s, m)` commands in each state; by default the scene is under the commands of all of them.
 
     The attribute `scales` `(2,)` holds the length of the arrow of a unit force, and that of a unit force per length;
     infinite if there is none. `to_one_scale` makes them the same in several.
     """
 
-    def __init__(self, scene: Scene, x: np.ndarray, commands: Numbers | None = None) -> None:
+    def __init__(self, scene: Scene) -> None:
         rest = np.asarray(scene.mesh.nodes)
-        self.scene, self.x, self.edges = scene, x, outline(scene)
-        self.size = float(np.ptp(rest[:, :2], axis=0).max())
+        self.scene, self.rest, self.edges = scene, rest[:, :2], outline(scene)
+        self.size = float(np.ptp(self.rest, axis=0).max())
         self.loaded = [k for k, term in enumerate(scene.terms) if _point_loads(term, rest) is not None]
         self.rows = [row for k, term in enumerate(scene.terms) for row in _rows(k, term, rest, SPACING * self.size)]
         probe = jnp.zeros((1, 2), rest.dtype)
         self.rigid = [k for k, term in enumerate(scene.terms) if term.kind.obstacle(probe, term.params) is not None]
-        self.tied, self.bases, self.tooth = _tied(scene, self.edges, x, self.size)
-        acts = bool(self.loaded or self.rows or self.rigid)
-        rows = None if commands is None or not acts else np.asarray(commands)
-        self.scenes = [scene] * len(x) if rows is None else [command(scene, row) for row in rows]
-        self.forces = [self._forces(each, here) for each, here in zip(self.scenes, x, strict=True)] if acts else []
-        self.scales = self._own_scales()
+        self.tied, self.tied_to, self.tooth = _tied(scene, self.size)
+        self.bases, self.farthest = np.zeros((0, 2)), np.zeros((len(self.tied), 2))
+        self.scales = np.full(2, np.inf)
 
-    def _forces(self, scene: Scene, x: np.ndarray) -> Forces:
+    @property
+    def any(self) -> bool:
+        """Whether anything acts, so that states must be seen."""
+        return bool(self.loaded or self.rows or self.rigid or len(self.tied))
+
+    def see(self, scene: Scene, x: np.ndarray) -> Acted:
+        """What acts in a state: the scene under the commands of this state, and positions `(n, d)`."""
         found = [_point_loads(scene.terms[k], x) for k in self.loaded]
         at, force = np.concatenate([np.zeros((0, 2, 2)), *(each for each in found if each is not None)]).swapaxes(0, 1)
-        return Forces(at, force, [self._row(scene.terms[row.term], x, row) for row in self.rows])
+        state = Acted(scene, x, at, force, [self._row(scene.terms[row.term], x, row) for row in self.rows])
+        self._rescale(state)
+        if len(self.tied):
+            moved = x[self.tied, :2] - self.tied_to
+            farther = np.linalg.norm(moved, axis=1) >= np.linalg.norm(self.farthest, axis=1)
+            self.farthest = np.where(farther[:, None], moved, self.farthest)
+            long = SPRING * self.size + FURTHER * np.linalg.norm(self.farthest, axis=1)
+            long = np.minimum(long, LONGEST * self.size)
+            self.bases = self.tied_to + long[:, None] * _outward(self.rest, self.edges, self.tied, self.farthest)
+        return state
+
+    def see_all(self, commands: np.ndarray, x: np.ndarray) -> list[Acted]:
+        """The states with commands `(s, m)` and positions `(s, n, d)`."""
+        scenes = [command(self.scene, row) for row in commands] if self.any else [self.scene] * len(x)
+        return [self.see(scene, here) for scene, here in zip(scenes, x, strict=True)]
 
     def _row(self, term: Term, x: np.ndarray, row: Row) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         nodes, k = x[term.nodes[row.stencils]], term.nodes.shape[1]
@@ -98,21 +119,19 @@ class Acting:
         at = np.einsum("mk,mkd->md", edge_functions(k, row.xi), ends)
         return at, np.asarray(term.kind.edge_loads(nodes, params, row.xi)), outward
 
-    def _own_scales(self) -> np.ndarray:
-        """The scales at which the longest arrow of a force, and of a row, has the length that it may have."""
-        found = np.full(2, np.inf)
-        for k, (_, force, rows) in enumerate(self.forces):
-            most = np.linalg.norm(force, axis=1).max(initial=0.0)
-            found[0] = min(found[0], ARROW * self.size / most if most > 0 else np.inf)
-            for at, load, outward in rows:
-                most = np.linalg.norm(load, axis=1).max()
-                room = min(ROW * self.size, ROOM * _quantile(_clearance(at, outward, self._pieces(k))))
-                found[1] = min(found[1], room / most if most > 0 else np.inf)
-        return found
+    def _rescale(self, state: Acted) -> None:
+        """Shorten the arrows if the longest one of a force, or of a row, is now longer than it may be."""
+        most = np.linalg.norm(state.force, axis=1).max(initial=0.0)
+        rooms = [(0, ARROW * self.size, most)]
+        for at, load, outward in state.rows:
+            clear = ROOM * _quantile(_clearance(at, outward, self._pieces(state)))
+            rooms.append((1, min(ROW * self.size, clear), np.linalg.norm(load, axis=1).max()))
+        for k, room, most in rooms:
+            self.scales[k] = min(self.scales[k], room / most if most > 0 else np.inf)
 
-    def _pieces(self, k: int) -> np.ndarray:
-        """Segments `(e, 2, 2)` of the outline in state `k`."""
-        curves = edge_curves(self.x[k], self.edges)
+    def _pieces(self, state: Acted) -> np.ndarray:
+        """Segments `(e, 2, 2)` of the outline."""
+        curves = edge_curves(state.x, self.edges)
         return np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 2)
 
     @property
@@ -122,30 +141,30 @@ class Acting:
         some = [k for terms, scale in zip(drawn, self.scales, strict=True) if np.isfinite(scale) for k in terms]
         return list(dict.fromkeys(self.scene.terms[k].kind.name for k in some))
 
-    def arrows(self, k: int) -> np.ndarray:
-        """Arrows `(q, 2, 2)` of the forces on points in state `k`: tail and head of each that is not zero.
+    def arrows(self, state: Acted) -> np.ndarray:
+        """Arrows `(q, 2, 2)` of the forces on points: tail and head of each that is not zero.
 
         The tail is at the point where the force acts, or the head if less of the arrow then lies in the body.
         """
-        at, force, _ = self.forces[k]
+        at, force = state.at, state.force
         some = force.any(axis=1)
         at, long = at[some], self.scales[0] * force[some] if some.any() else force[some]
         if not len(at) or self.scene.mesh.is_line:
             return np.stack([at, at + long], axis=1)
         samples = np.array([0.3, 0.6, 0.95])[:, None, None] * long
-        pulled, pushed = (_inside(at + sign * samples, self._pieces(k)).sum(axis=0) for sign in (1, -1))
+        pulled, pushed = (_inside(at + sign * samples, self._pieces(state)).sum(axis=0) for sign in (1, -1))
         tails = at - np.where((pushed < pulled)[:, None], long, 0)
         return np.stack([tails, tails + long], axis=1)
 
-    def combs(self, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each row in state `k` its arrows `(r, 2, 2)`, and the points `(r, 2)` of the line that joins them.
+    def combs(self, state: Acted) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each row its arrows `(r, 2, 2)`, and the points `(r, 2)` of the line that joins them.
 
         The arrows lie outside the body: heads at the surface where the force pushes, tails where it pulls. They are
         joined if all push or all pull. Of arrows along the surface every other one is left out, so that there are
         gaps between them.
         """
         found = []
-        for at, force, outward in self.forces[k].rows:
+        for at, force, outward in state.rows:
             norm = np.linalg.norm(force, axis=1, keepdims=True)
             some = norm[:, 0] > 0
             if not some.any():
@@ -161,39 +180,39 @@ class Acting:
             found.append((np.stack([tails, tails + long], axis=1)[some], joined))
         return found
 
-    def obstacles(self, k: int) -> list[Distance]:
-        """For each obstacle the distance from it in state `k`, a function of points `(..., 2)`."""
-        terms = [self.scenes[k].terms[number] for number in self.rigid]
-        return [partial(_distance, term, self.x.dtype) for term in terms]
+    def obstacles(self, state: Acted) -> list[Distance]:
+        """For each obstacle the distance from it, a function of points `(..., 2)`."""
+        return [partial(_distance, state.scene.terms[k], state.x.dtype) for k in self.rigid]
 
-    def zigzags(self, k: int) -> np.ndarray:
-        """Points `(q, p, 2)` of each spring in state `k`, from its base outside the body to its node."""
-        start, run = self.bases, self.x[k][self.tied, :2] - self.bases
+    def zigzags(self, state: Acted) -> np.ndarray:
+        """Points `(q, p, 2)` of each spring, from its base outside the body to its node."""
+        start, run = self.bases, state.x[self.tied, :2] - self.bases
         across = np.stack([-run[:, 1], run[:, 0]], axis=1)
         across = self.tooth * across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
         along = np.array([0.0, *np.linspace(0.2, 0.8, 2 * TEETH + 1), 1.0])
         side = np.array([0.0, 0.0, *np.resize([1.0, -1.0], 2 * TEETH - 1), 0.0, 0.0])
         return start[:, None] + along[:, None] * run[:, None] + side[:, None] * across[:, None]
 
-    def extremes(self, shown: Sequence[int] | None = None) -> list[np.ndarray]:
-        """Points `(..., 2)` that span all of this in all states, or those `shown`; of obstacles, what is near."""
-        shown = range(len(self.forces)) if shown is None else shown
-        found = [self.bases, *self._rims(shown)]
-        for k in shown if self.forces else ():
-            found += [self.arrows(k), *(arrows for arrows, _ in self.combs(k))]
+    def extremes(self, states: Sequence[Acted]) -> list[np.ndarray]:
+        """Points `(..., 2)` that span all of this in these states; of obstacles, what is near."""
+        if not self.any:
+            return []
+        found = [self.bases, *self._rims(states)]
+        for state in states:
+            found += [self.arrows(state), *(arrows for arrows, _ in self.combs(state))]
         return found
 
-    def _rims(self, shown: Sequence[int]) -> list[np.ndarray]:
+    def _rims(self, states: Sequence[Acted]) -> list[np.ndarray]:
         """Points of each obstacle a little inside its boundary, straight beside, below or above the body."""
         if not self.rigid:
             return []
-        body = np.concatenate([points.reshape(-1, 2) for points in extremes(self.scene, self.x[shown])])
+        body = np.concatenate([p.reshape(-1, 2) for p in extremes(self.scene, np.stack([s.x for s in states]))])
         low, high = body.min(axis=0), body.max(axis=0)
         size = (high - low).max()
         grid = np.meshgrid(*np.linspace(low - REACH * size, high + REACH * size, 61).T)
         points = np.stack([each.ravel() for each in grid], axis=1)
         points = points[((low <= points) & (points <= high)).any(axis=1)]
-        depths = [-distance(points) / size for k in shown for distance in self.obstacles(k)]
+        depths = [-distance(points) / size for state in states for distance in self.obstacles(state)]
         return [points[(depth > SHALLOW) & (depth < DEEP)] for depth in depths]
 
 
@@ -275,23 +294,16 @@ def _quantile(lengths: np.ndarray) -> float:
     return float(np.sort(lengths)[int(QUANTILE * len(lengths))])  # np.quantile turns infinite ones into NaN
 
 
-def _tied(scene: Scene, edges: np.ndarray, x: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Nodes `(q,)` that springs hold, the bases `(q, 2)` of the springs, and how far their teeth stand out.
-
-    The bases lie outside the body, beyond where the node goes in the states `x` `(s, n, d)`.
-    """
+def _tied(scene: Scene, size: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Nodes `(q,)` that springs hold, the points `(q, 2)` they are tied to, and how far the teeth stand out."""
     found = [(np.asarray(term.nodes)[:, 0], term.kind.springs(term.params)) for term in scene.terms]
     held = [(nodes, np.asarray(points)) for nodes, points in found if points is not None]
     if not held:
         return np.zeros(0, int), np.zeros((0, 2)), 0.0
-    nodes = np.concatenate([each for each, _ in held])
     points = np.concatenate([each for _, each in held])
-    moved = x[:, nodes, :2] - points
-    long = np.minimum(SPRING * size + FURTHER * np.linalg.norm(moved, axis=2).max(axis=0), LONGEST * size)
-    bases = points + long[:, None] * _outward(np.asarray(scene.mesh.nodes)[:, :2], edges, nodes, moved[-1])
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     nearest = gaps[gaps > 1e-9 * size].min(initial=np.inf)
-    return nodes, bases, float(min(TOOTH * size, 0.3 * nearest))
+    return np.concatenate([each for each, _ in held]), points, float(min(TOOTH * size, 0.3 * nearest))
 
 
 def _outward(rest: np.ndarray, edges: np.ndarray, nodes: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,10 +13,21 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, FuncAnimatio
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.acting import Acting, to_one_scale
-from jaxbeam.plot.drawing import OUTLINE, PAPER, _Beam, _commands, _doing, _fit, _legend, _panels, _prepare, limits
+from jaxbeam.plot.acting import Acted, Acting, to_one_scale
+from jaxbeam.plot.drawing import (
+    OUTLINE,
+    PAPER,
+    add_legend,
+    command_title,
+    doing_of,
+    fit_height,
+    limits,
+    panels,
+    prepare,
+)
+from jaxbeam.plot.fields import Field, Scale, scales_of
 from jaxbeam.plot.lines import extremes
-from jaxbeam.plot.loads import draw_acting
+from jaxbeam.plot.picture import Panel, add_colour_bar
 from jaxbeam.plot.states import States
 from jaxbeam.plot.stills import curves
 from jaxbeam.scene.measures import tip_angle
@@ -32,6 +44,8 @@ def animate_ramp(
     states: States,
     measure: Callable[[Scene, jax.Array], jax.Array] = tip_angle,
     label: str = "tip angle (degrees)",
+    *,
+    field: Field | None = None,
 ) -> FuncAnimation:
     """A beam in motion, and beside it the curve that it traces.
 
@@ -39,11 +53,13 @@ def animate_ramp(
         states: the states to show in order, such as a ramp.
         measure: as in `curves`.
         label: text of the curve's vertical axis: quantity and unit.
+        field: what to show in colour: a `Field` of a function.
     """
     figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
     left, right = figure.subplots(1, 2)
-    acting = [Acting(states.scene, states.x, states.commands)]
-    _prepare(left, limits(*extremes(states.scene, states.x), *acting[0].extremes()))
+    acting = Acting(states.scene)
+    seen = acting.see_all(states.commands, states.x)
+    prepare(left, limits(*extremes(states.scene, states.x), *acting.extremes(seen)))
     curves([states], measure, label, ax=right)
     # The whole curve stays as a pale trace, so that the axes do not move, and one line on top of it grows.
     traced = []
@@ -57,26 +73,31 @@ def animate_ramp(
             line.set_data(*points[: frame + 1].T)
         head.set_data(*np.transpose([points[frame] for _, points in traced]))
 
-    return _play(figure, [left], [states], acting, trace)
+    return _play(figure, [left], [states], [acting], [seen], field, trace)
 
 
-def animate_beams(states: Sequence[States]) -> FuncAnimation:
+def animate_beams(states: Sequence[States], *, field: Field | None = None) -> FuncAnimation:
     """Several beams side by side, to one scale and in step.
 
     Args:
         states: one for each panel, all with the same number of states.
+        field: what to show in colour: a `Field` of a function. All panels have one colour scale.
 
     Raises:
-        ValueError: if `states` is empty or the numbers of states differ.
+        ValueError: if `states` is empty, the numbers of states differ, or the field is not one of a function or has
+            values that cannot be drawn.
     """
     if not states:
         raise ValueError("states: expected at least one States, got none")
     if len({len(each) for each in states}) > 1:
         raise ValueError(f"states: expected as many states in each, got {[len(each) for each in states]}")
-    acting = to_one_scale([Acting(each.scene, each.x, each.commands) for each in states])
-    bounds = limits(*(points for each in acting for points in extremes(each.scene, each.x) + each.extremes()))
-    figure, axes = _panels(len(states), [bounds])
-    return _play(figure, axes, states, acting)
+    acting = [Acting(each.scene) for each in states]
+    seen = [outer.see_all(each.commands, each.x) for outer, each in zip(acting, states, strict=True)]
+    to_one_scale(acting)
+    points = [extremes(each.scene, each.x) for each in states]
+    points += [outer.extremes(shown) for outer, shown in zip(acting, seen, strict=True)]
+    figure, axes = panels(len(states), [limits(*itertools.chain(*points))])
+    return _play(figure, axes, states, acting, seen, field)
 
 
 def save_animation(animation: FuncAnimation, path: str | Path, fps: int = 12, dpi: float = 110) -> None:
@@ -109,29 +130,32 @@ def _play(
     axes: Sequence[Axes],
     states: Sequence[States],
     acting: Sequence[Acting],
+    seen: Sequence[Sequence[Acted]],
+    field: Field | None,
     trace: Callable[[int], None] = lambda frame: None,
 ) -> FuncAnimation:
     """Animate each of `states`, and what acts on it, on its axes.
 
     `trace(frame)` draws whatever else changes from frame to frame.
     """
-    beams = [_Beam(ax, each.scene) for ax, each in zip(axes, states, strict=True)]
-    around = [draw_acting(ax, each) for ax, each in zip(axes, acting, strict=True)]
-    doing = [each.measure(_doing) for each in states]
-    _legend(figure, acting, doing)
+    doing, values = [each.measure(doing_of) for each in states], [each.values(field) for each in states]
+    drawn = zip((each.scene for each in states), values, strict=True)
+    scales: Sequence[Scale | None] = scales_of(field, list(drawn)) if field else [None] * len(states)
+    beams = [Panel(*each) for each in zip(axes, acting, scales, strict=True)]
+    if field and scales[-1]:
+        add_colour_bar(figure, axes, beams, field.label, scales[-1])
+    add_legend(figure, acting, doing)
 
     def draw(frame: int) -> None:
-        for ax, artists, outer, each, does in zip(axes, beams, around, states, doing, strict=True):
-            artists.move(each.x[frame], does[frame])
-            outer(frame)
-            ax.set_title(
-                "\n".join(filter(None, [each.title, _commands(each.scene, each.commands[frame])])), fontsize="medium"
-            )
+        for panel, shown, each, does, colours in zip(beams, seen, states, doing, values, strict=True):
+            panel.show(shown[frame], does[frame], colours[frame])
+            title = "\n".join(filter(None, [each.title, command_title(each.scene, each.commands[frame])]))
+            panel.ax.set_title(title, fontsize="medium")
         trace(frame)
 
     # Lay out the panels once: a new layout for every frame would be slow, and the panels would jitter.
     draw(0)
-    _fit(figure, axes[:1])
+    fit_height(figure, axes[:1])
     figure.draw_without_rendering()
     # Give None, not "none": that sets a placeholder, with which each frame is drawn twice. None stands for the engine
     # that `rcParams` ask for, so they must ask for none here.

@@ -8,14 +8,18 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import Collection, LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
+from jaxbeam.core.compiling import one_program
 from jaxbeam.core.tree import Numbers
 from jaxbeam.plot.acting import Acting
+from jaxbeam.plot.fields import Scale, Smooth
 from jaxbeam.plot.lines import (
     arms,
     drawn_terms,
@@ -40,7 +44,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
 # Dashes of a tendon that pushes, and of the unstable part of a branch.
 PUSHING = (0, (2.2, 1.3))
-# What a tendon does beside pulling, numbered as `_doing` has it, and how it looks then.
+# What a tendon does beside pulling, numbered as `doing_of` has it, and how it looks then.
 DOING = ("", "pushing", "slack")
 LOOKS: tuple[dict[str, Any], ...] = (
     {"linestyle": "-", "linewidth": 2.0, "alpha": None},
@@ -75,10 +79,13 @@ def limits(*positions: Numbers, margin: float = 0.05) -> Limits:
 # --------------------------------------------------------------------------------------------- internals
 
 
-class _Beam:
-    """The artists of one beam; `move` places them for given positions of the nodes."""
+class Body:
+    """The artists of one beam; `move` places them for given positions of the nodes.
 
-    def __init__(self, ax: Axes, scene: Scene, tendon_colours: Sequence[str] = PALETTE) -> None:
+    The attribute `artists` lists those that move.
+    """
+
+    def __init__(self, ax: Axes, scene: Scene, scale: Scale | None = None) -> None:
         self.scene, self.elements, self.edges = scene, elements_of(scene), outline(scene)
         self.patches, self.shares, pulling = patches(scene)
         self.rod, self.names = scene.mesh.is_line, line_names(scene)
@@ -88,7 +95,7 @@ class _Beam:
         self.body = PolyCollection([], facecolor=BODY, edgecolor=MESH, linewidth=0.35, capstyle="round", zorder=2)
         width = 2.6 if self.rod else 0.9
         self.outline = LineCollection([], colors=OUTLINE, linewidths=width, capstyle="round", zorder=3)
-        colours = [tendon_colours[number % len(tendon_colours)] for number in range(len(self.names))]
+        colours = [PALETTE[number % len(PALETTE)] for number in range(len(self.names))]
         # What holds a tendon that is not attached to a node: a patch of surface, or an arm of the rod.
         width = 0.9 if self.rod else 2.8
         self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
@@ -101,11 +108,40 @@ class _Beam:
         for colour in colours:
             self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
         (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
+        self.artists: list[Artist] = [self.body, self.outline, self.held, *self.tendons, self.guides, self.supports]
+        self.smooth: Smooth | None = None
+        if scale:
+            self._colour(ax, scale)
 
-    def move(self, x: np.ndarray, doing: np.ndarray) -> None:
-        """Draw the beam at `x` `(n, 2)`; tendons that push or are slack, by `doing` `(m,)`, look different."""
-        around: Any = rings(x, self.elements)  # matplotlib is far quicker with an array than with the list it asks for
-        self.body.set_verts(around, closed=not self.rod)
+    def _colour(self, ax: Axes, scale: Scale) -> None:
+        """Prepare for a field in colour. A white rim keeps tendons apart from the colours below them."""
+        self.outline.set_visible(not self.rod)
+        self.body.set(edgecolor="face", linewidth=5.0 if self.rod else 0.2, cmap=scale.cmap, norm=scale.norm)
+        for line in self.tendons:
+            line.set_path_effects([withStroke(linewidth=4.0, foreground="white")])
+        if scale.at_nodes and not self.rod:
+            self.smooth = Smooth(ax, self.elements, scale)
+            self.artists[0] = self.smooth.mesh
+            self.body.set_visible(False)
+
+    @property
+    def coloured(self) -> Collection:
+        """What carries the colours of a field."""
+        return self.smooth.mesh if self.smooth else self.body
+
+    def move(self, x: np.ndarray, doing: np.ndarray, values: np.ndarray | None = None) -> None:
+        """Draw the beam at `x` `(n, d)`.
+
+        Tendons that push or are slack, by `doing` `(m,)`, look different. `values` are those of the field, if any.
+        """
+        if self.smooth:
+            self.smooth.move(x, values)
+        else:
+            around: Any = rings(x, self.elements)  # matplotlib is far quicker with an array than with a list
+            self.body.set_verts(around, closed=not self.rod)
+            if values is not None:
+                at_nodes = self.rod and len(values) == len(x)
+                self.body.set_array(values[self.elements].mean(axis=1) if at_nodes else values)
         self.outline.set_segments(list(edge_curves(x, self.edges)))
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
         self.supports.set_data(*x[self.supported, :2].T)
@@ -118,7 +154,8 @@ class _Beam:
             line.set(label=name + f" ({DOING[what]})" * bool(what), **LOOKS[what])
 
 
-def _doing(scene: Scene, x: jax.Array) -> jax.Array:
+@one_program
+def doing_of(scene: Scene, x: jax.Array) -> jax.Array:
     """What each of the drawn lines, such as tendons, does, `(m,)`: 0 if it pulls, 1 if it pushes, 2 if it is slack.
 
     Positions are scaled by 1 + 1e-5, so that round-off does not make a line at its commanded length look compressed. A
@@ -133,7 +170,7 @@ def _doing(scene: Scene, x: jax.Array) -> jax.Array:
     return jnp.concatenate([*found, jnp.zeros(0, int)])
 
 
-def _positions(scene: Scene, x: Numbers) -> np.ndarray:
+def positions_of(scene: Scene, x: Numbers) -> np.ndarray:
     """Node positions as a NumPy array, checked to be finite."""
     positions = np.asarray(placed(scene, x))
     if not np.isfinite(positions).all():
@@ -157,14 +194,14 @@ def _draw_clamp(ax: Axes, scene: Scene, edges: np.ndarray) -> None:
     ax.add_collection(LineCollection(list(lines), colors=OUTLINE, linewidths=2.2, zorder=4), autolim=False)
 
 
-def _prepare(ax: Axes, bounds: Limits) -> Axes:
+def prepare(ax: Axes, bounds: Limits) -> Axes:
     """Set limits, labels and equal scales of axes for a beam."""
     ax.set(xlim=bounds[0], ylim=bounds[1], xlabel="x (length units)", ylabel="y (length units)")
     ax.set_aspect("equal")
     return ax
 
 
-def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
+def panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
     """A figure of equally wide panels on one scale, and their axes, row by row. Only the outer panels have labels.
 
     Args:
@@ -177,7 +214,7 @@ def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
     grid = figure.subplots(len(rows), columns, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     for panels, bounds in zip(grid, rows, strict=True):
         for ax in panels:
-            _prepare(ax, bounds).label_outer()
+            prepare(ax, bounds).label_outer()
     if len(rows) > 1:  # one label for all rows: a flat panel has no room for its own
         figure.supylabel("y (length units)", fontsize="medium")
         for ax in grid[:, 0]:
@@ -185,7 +222,7 @@ def _panels(columns: int, rows: Sequence[Limits]) -> tuple[Figure, list[Axes]]:
     return figure, list(grid.ravel())
 
 
-def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
+def fit_height(figure: Figure, axes: Sequence[Axes]) -> None:
     """Set the height of the figure to what its panels need, so that none floats in empty space.
 
     Args:
@@ -206,13 +243,13 @@ def _fit(figure: Figure, axes: Sequence[Axes]) -> None:
         ax.set_aspect("equal")
 
 
-def _legend(figure: Figure, acting: Sequence[Acting], doing: Sequence[np.ndarray]) -> None:
+def add_legend(figure: Figure, acting: Sequence[Acting], doing: Sequence[np.ndarray]) -> None:
     """One legend below all panels.
 
     Args:
         figure: of the panels.
         acting: what acts on each beam.
-        doing: for each beam, `(..., m)` numbers from `_doing`, of one state or of several.
+        doing: for each beam, `(..., m)` numbers from `doing_of`, of one state or of several.
     """
     names = max((line_names(each.scene) for each in acting), key=len)
     handles = [Line2D([], [], color=PALETTE[k % len(PALETTE)], lw=2, label=name) for k, name in enumerate(names)]
@@ -224,7 +261,7 @@ def _legend(figure: Figure, acting: Sequence[Acting], doing: Sequence[np.ndarray
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False)
 
 
-def _commands(scene: Scene, commands: np.ndarray) -> str:
+def command_title(scene: Scene, commands: np.ndarray) -> str:
     """A title that states the commands `(m,)` of a scene, as ratios if all of them are."""
     ratios = all(term.kind.command_unit == 1 for term in commanded_terms(scene))
     return ("ratios " if ratios else "commands ") + ", ".join(f"{command:.2f}" for command in commands)

@@ -10,7 +10,7 @@ import itertools
 
 import numpy as np
 
-from jaxbeam.core.tree import Numbers
+from jaxbeam.core.tree import Numbers, is_concrete
 from jaxbeam.mesh.element import edge_functions
 from jaxbeam.mesh.elements import ELEMENTS, element_of
 from jaxbeam.mesh.surface import surface, walk
@@ -51,7 +51,8 @@ def rings(x: np.ndarray, elements: np.ndarray) -> np.ndarray:
 
 def drawn_terms(scene: Scene) -> list[tuple[Term, np.ndarray]]:
     """The terms that are drawn as lines, and for each the number, over all of them, of each of its lines."""
-    x = np.asarray(scene.mesh.nodes)
+    rest = scene.mesh.nodes
+    x = np.asarray(rest) if is_concrete(rest) else rest
     drawn = [term for term in scene.terms if term.kind.line(x[term.nodes], term.params) is not None]
     ends = np.cumsum([0, *(len(term.nodes) for term in drawn)])
     return [(term, np.arange(*pair)) for term, pair in zip(drawn, itertools.pairwise(ends), strict=True)]

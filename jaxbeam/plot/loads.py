@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -12,7 +13,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from jaxbeam.plot.acting import Acting, Distance
+from jaxbeam.plot.acting import Acted, Acting, Distance
 
 # Colours of forces, of springs, and of an obstacle and its boundary.
 FORCE, SPRING, RIGID, RIM = "#111111", "#33414E", "#E6E6E6", "#7A7A7A"
@@ -46,56 +47,71 @@ class _Arrows:
         self.heads.set_verts(heads)
 
 
-def draw_acting(ax: Axes, acting: Acting) -> Callable[[int], None]:
-    """Make the artists of what acts on a body, none if nothing does, and return the function that draws a state."""
-    moves: list[Callable[[int], None]] = []
-    label = ", ".join(acting.names)
-    if acting.rigid:
-        moves.append(_Rigid(ax, acting).move)
-    if len(acting.tied):
-        moves.append(_draw_springs(ax, acting))
-    if acting.loaded and label:
-        single = _Arrows(ax, label, 1.4, HEAD * acting.size)
-        moves.append(lambda k: single.move(acting.arrows(k)))
-    if acting.rows and label:
-        row = _Arrows(ax, "_" if acting.loaded else label, 0.9, 0.7 * HEAD * acting.size)
-        joining = LineCollection([], colors=FORCE, linewidths=0.7, zorder=8)
-        ax.add_collection(joining, autolim=False)
+class Outside:
+    """The artists of what acts on a body from outside; `move` places them. An artist is made when it is first needed.
 
-        def move(k: int) -> None:
-            combs = acting.combs(k)
-            row.move(np.concatenate([np.zeros((0, 2, 2)), *(arrows for arrows, _ in combs)]))
-            joining.set_segments([line for _, line in combs if len(line)])
-
-        moves.append(move)
-
-    def draw(k: int) -> None:
-        for each in moves:
-            each(k)
-
-    return draw
-
-
-def _draw_springs(ax: Axes, acting: Acting) -> Callable[[int], None]:
-    springs = LineCollection([], colors=SPRING, linewidths=0.9, joinstyle="round", zorder=3.5)
-    ax.add_collection(springs, autolim=False)
-    ax.plot(*acting.bases.T, linestyle="", marker="s", markersize=2.5, color=SPRING, zorder=3.5)
-    return lambda k: springs.set_segments(list(acting.zigzags(k)))
-
-
-class _Rigid:
-    """Obstacles: grey inside, a line at distance zero, and hatching along it. They are made anew for each state."""
+    The attribute `artists` lists those that there are now.
+    """
 
     def __init__(self, ax: Axes, acting: Acting) -> None:
         self.ax, self.acting = ax, acting
-        self.artists: list[Artist] = []
+        self.single: _Arrows | None = None
+        self.row: _Arrows | None = None
+        self.joining, self.springs = LineCollection([]), LineCollection([])
+        self.kept: list[Artist] = []
+        self.rigid: list[Artist] = []
+        self.place: Any = None
+        if len(acting.tied):
+            self.springs = self._keep(LineCollection([], colors=SPRING, linewidths=0.9, joinstyle="round", zorder=3.5))
+            (self.bases,) = ax.plot([], [], linestyle="", marker="s", markersize=2.5, color=SPRING, zorder=3.5)
+            self.kept.append(self.bases)
 
-    def move(self, k: int) -> None:
-        for artist in self.artists:
+    @property
+    def artists(self) -> list[Artist]:
+        """All artists."""
+        return [*self.kept, *self.rigid]
+
+    def move(self, state: Acted) -> None:
+        """Draw a state that the `Acting` has seen."""
+        acting, label = self.acting, ", ".join(self.acting.names)
+        self._move_obstacles(state)
+        if len(acting.tied):
+            self.springs.set_segments(list(acting.zigzags(state)))
+            self.bases.set_data(*acting.bases.T)
+        if acting.loaded and label:
+            self.single = self.single or self._arrows(label, 1.4, HEAD)
+            self.single.move(acting.arrows(state))
+        if acting.rows and label:
+            if self.row is None:
+                self.row = self._arrows("_" if acting.loaded else label, 0.9, 0.7 * HEAD)
+                self.joining = self._keep(LineCollection([], colors=FORCE, linewidths=0.7, zorder=8))
+            combs = acting.combs(state)
+            self.row.move(np.concatenate([np.zeros((0, 2, 2)), *(arrows for arrows, _ in combs)]))
+            self.joining.set_segments([line for _, line in combs if len(line)])
+
+    def _keep(self, lines: LineCollection) -> LineCollection:
+        self.ax.add_collection(lines, autolim=False)
+        self.kept.append(lines)
+        return lines
+
+    def _arrows(self, label: str, width: float, head: float) -> _Arrows:
+        made = _Arrows(self.ax, label, width, head * self.acting.size)
+        self.kept += [made.shafts, made.heads]
+        return made
+
+    def _move_obstacles(self, state: Acted) -> None:
+        """Draw the obstacles anew if they, or the limits of the axes, have changed: that takes a tenth of a second."""
+        params = [state.scene.terms[k].params for k in self.acting.rigid]
+        place = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)], self.ax.viewLim.bounds
+        if place == self.place or not self.acting.rigid:
+            return
+        self.place = place
+        for artist in self.rigid:
             artist.remove()
-        self.artists = [artist for distance in self.acting.obstacles(k) for artist in self._drawn(distance)]
+        self.rigid = [artist for distance in self.acting.obstacles(state) for artist in self._obstacle(distance)]
 
-    def _drawn(self, distance: Distance) -> list[Artist]:
+    def _obstacle(self, distance: Distance) -> list[Artist]:
+        """An obstacle: grey inside, a line at distance zero, and hatching along it."""
         sides = [np.sort(limits) for limits in (self.ax.get_xlim(), self.ax.get_ylim())]
         step = max(float(np.ptp(side)) for side in sides) / GRID
         x, y = np.meshgrid(*(np.linspace(side[0], side[1], 2 + int(np.ptp(side) / step)) for side in sides))

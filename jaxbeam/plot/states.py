@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.tree import Numbers
+from jaxbeam.plot.fields import Field
 from jaxbeam.scene.scene import Scene, command, command_count
 
 
@@ -44,6 +46,10 @@ class States:
         """`function(scene, x)` of every state, such as `tip_angle` or `tendon_tensions`: leading axis `s`."""
         one = lambda ratios, x: function(command(self.scene, ratios), x)
         return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(self.commands), jnp.asarray(self.x)))
+
+    def values(self, field: Field | None) -> Any:
+        """Values of a field in every state, `(s, n)` or `(s, t)`; None for each state if there is no field."""
+        return [None] * len(self) if field is None else self.measure(field.function())
 
     @property
     def actuation(self) -> np.ndarray:

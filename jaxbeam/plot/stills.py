@@ -1,4 +1,4 @@
-"""Still pictures: a beam, fields on it, curves of measures, branches of equilibria, and galleries of states.
+"""Curves of measures, branches of equilibria, and galleries of states.
 
 `jaxbeam.plot` describes what all pictures have in common.
 """
@@ -9,15 +9,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 
-from jaxbeam.core.tree import Numbers
 from jaxbeam.plot.acting import Acting
 from jaxbeam.plot.drawing import (
     MARKERS,
@@ -25,112 +21,20 @@ from jaxbeam.plot.drawing import (
     PALETTE,
     PAPER,
     UNSTABLE,
-    Limits,
-    _Beam,
-    _commands,
-    _doing,
-    _fit,
-    _legend,
-    _panels,
-    _positions,
-    _prepare,
+    add_legend,
+    command_title,
+    doing_of,
+    fit_height,
     limits,
+    panels,
 )
-from jaxbeam.plot.lines import elements_of, extremes
-from jaxbeam.plot.loads import draw_acting
+from jaxbeam.plot.fields import Field, scales_of
+from jaxbeam.plot.lines import extremes
+from jaxbeam.plot.picture import Panel, add_colour_bar
 from jaxbeam.plot.states import States
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene
 from jaxbeam.study.branch import Branch
-
-# ----------------------------------------------------------------------------------------------- stills
-
-
-def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | None = None) -> Axes:
-    """The beam with its mesh, tendons, guides and anchors, clamp, what acts on it, and its outline at rest.
-
-    Args:
-        scene: under the commands of this state, which decide which tendons push and where obstacles are.
-        x: `(n, 2)` node positions.
-        ax: where to draw (`ax.legend()` names what is there); by default a new figure with a legend.
-        bounds: axis limits, by default those that hold the beam here and at rest, and what acts on it.
-
-    Raises:
-        ValueError: if `x` has another shape or is not finite.
-    """
-    positions = _positions(scene, x)
-    acting = Acting(scene, positions[None])
-    bounds = bounds or limits(*extremes(scene, positions[None]), *acting.extremes())
-    figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
-    doing = np.asarray(_doing(scene, jnp.asarray(positions)))
-    _Beam(axes[0], scene).move(positions, doing)
-    draw_acting(axes[0], acting)(0)
-    if figure:
-        _legend(figure, [acting], [doing])
-        _fit(figure, axes)
-    return axes[0]
-
-
-def field(
-    scene: Scene,
-    x: Numbers,
-    values: Numbers,
-    label: str,
-    *,
-    centre: float | None = None,
-    colours: tuple[float, float] | None = None,
-    ax: Axes | None = None,
-    bounds: Limits | None = None,
-) -> Axes:
-    """One value for each element in colour, with a colour bar.
-
-    Sequential colours (viridis), or diverging ones (red above, blue below) about `centre`.
-
-    Args:
-        scene: what the values were measured on, under the commands of this state.
-        x: `(n, 2)` node positions.
-        values: `(t,)`, one for each element of the solids, such as `jacobians(scene, x)`.
-        label: text of the colour bar: quantity and unit.
-        centre: value at which diverging colours change hue; by default 0 if the values have both signs.
-        colours: values at the two ends of the colour bar. By default they are the 1st and 99th percentile, because the
-            peak beside a node that carries a point load depends on the mesh. Pointed ends of the bar tell that there
-            are values beyond.
-        ax: where to draw; by default a new figure.
-        bounds: axis limits, by default those that hold the beam here and at rest.
-
-    Raises:
-        ValueError: if `x` or `values` has another shape or is not finite.
-    """
-    positions, numbers = _positions(scene, x), np.asarray(values)
-    count = len(elements_of(scene))
-    if numbers.shape != (count,):
-        raise ValueError(f"values: expected shape ({count},), one for each element, got {numbers.shape}")
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"values: element {np.flatnonzero(~np.isfinite(numbers))[0]} is not finite")
-    if centre is None and numbers.min() < 0 < numbers.max():
-        centre = 0.0
-    low, high = colours or np.quantile(numbers, [0.01, 0.99])
-    if centre is not None:
-        reach = max(abs(low - centre), abs(high - centre))
-        low, high = centre - reach, centre + reach
-    extend = ("neither", "min", "max", "both")[int(numbers.min() < low) + 2 * int(numbers.max() > high)]
-    acting = Acting(scene, positions[None])
-    bounds = bounds or limits(*extremes(scene, positions[None]), *acting.extremes())
-    figure, axes = (None, [_prepare(ax, bounds)]) if ax else _panels(1, [bounds])
-    artists = _Beam(axes[0], scene, tendon_colours=(OUTLINE,))
-    artists.move(positions, np.zeros(len(artists.tendons), int))
-    draw_acting(axes[0], acting)(0)
-    for line in artists.tendons:
-        line.set(linewidth=1.2, markersize=3, path_effects=[withStroke(linewidth=2.8, foreground="white")])
-    artists.body.set(array=numbers, cmap="viridis" if centre is None else "RdBu_r", norm=Normalize(low, high))
-    artists.body.set(edgecolor="face", linewidth=5.0 if artists.rod else 0.2)
-    artists.outline.set_visible(not artists.rod)
-    # An inset is as high as the panel, whatever the aspect of the panel.
-    bar = axes[0].inset_axes((1.03, 0.0, 0.035, 1.0))
-    axes[0].figure.colorbar(artists.body, cax=bar, label=label, extend=extend)
-    if figure:
-        _fit(figure, axes)
-    return axes[0]
 
 
 def curves(
@@ -230,40 +134,48 @@ def branches(
     return ax
 
 
-def gallery(states: States, titles: Sequence[str] | None = None, columns: int = 3) -> Figure:
+def gallery(
+    states: States, titles: Sequence[str] | None = None, columns: int = 3, *, field: Field | None = None
+) -> Figure:
     """A panel for each state, all to one scale.
 
     Args:
         states: the states to show, such as a sweep over asymmetric commands.
         titles: one for each state; by default its ratios.
         columns: number of panels in a row.
+        field: what to show in colour: a `Field` of a function. All panels have one colour scale.
 
     Raises:
-        ValueError: if the titles are not one for each state, or `columns` is less than 1.
+        ValueError: if the titles are not one for each state, `columns` is less than 1, or the field is not one of a
+            function or has values that cannot be drawn.
     """
-    titles = [_commands(states.scene, row) for row in states.commands] if titles is None else titles
+    titles = [command_title(states.scene, row) for row in states.commands] if titles is None else titles
     if len(titles) != len(states):
         raise ValueError(f"titles: expected {len(states)}, one for each state, got {len(titles)}")
     if columns < 1:
         raise ValueError(f"columns: expected at least 1, got {columns}")
     columns = min(columns, len(states))
-    acting = Acting(states.scene, states.x, states.commands)
-    hold = lambda shown: limits(*extremes(states.scene, states.x[shown]), *acting.extremes(shown))
+    acting = Acting(states.scene)
+    seen = acting.see_all(states.commands, states.x)
+    hold = lambda shown: limits(*extremes(states.scene, states.x[shown]), *acting.extremes([seen[k] for k in shown]))
     every = range(len(states))
     across = hold(every)[0]
     rows = [(across, hold(every[k : k + columns])[1]) for k in every[::columns]]
-    figure, axes = _panels(columns, rows)
+    figure, axes = panels(columns, rows)
     for k in range(len(states), len(axes)):
         axes[k].remove()
         axes[k - columns].tick_params(labelbottom=True)
         axes[k - columns].set_xlabel("x (length units)")
-    doing = states.measure(_doing)
-    for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
-        ax.set_title(title, fontsize="medium")
-        _Beam(ax, states.scene).move(states.x[k], doing[k])
-        draw_acting(ax, acting)(k)
-    _legend(figure, [acting], [doing])
-    _fit(figure, axes[::columns])
+    doing, values = states.measure(doing_of), states.values(field)
+    (scale,) = scales_of(field, [(states.scene, values)]) if field else (None,)
+    beams = [Panel(ax, acting, scale) for ax in axes[: len(states)]]
+    for panel, title, *each in zip(beams, titles, seen, doing, values, strict=True):
+        panel.ax.set_title(title, fontsize="medium")
+        panel.show(*each)
+    if field and scale:
+        add_colour_bar(figure, axes[: len(states)], beams, field.label, scale)
+    add_legend(figure, [acting], [doing])
+    fit_height(figure, axes[::columns])
     return figure
 
 

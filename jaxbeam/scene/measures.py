@@ -15,8 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.core.compiling import one_program
-from jaxbeam.mesh.element import Element
-from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.energy import Term
 from jaxbeam.scene.scene import Scene, placed
 
@@ -131,31 +129,7 @@ def cauchy_stress(scene: Scene, x: jax.Array) -> jax.Array:
     `P = d psi / d H` is the first Piola-Kirchhoff stress (Bonet and Wood 2008, eq. 5.49). Averaged over
     an element's quadrature points.
     """
-    return _over_elements(scene, x, _stress)
-
-
-@one_program
-def nodal_stress(scene: Scene, x: jax.Array) -> jax.Array:
-    """Cauchy stress `(n, 2, 2)` in the plane, recovered at the nodes: smoother than `cauchy_stress`, and more accurate.
-
-    In each element a field that is linear in the weights of its corners is fitted to the stress at the quadrature
-    points, by least squares with their weights, and carried to the nodes. At a node the elements that meet there are
-    averaged, weighted by area at rest (local smoothing: Hinton and Campbell 1974, Int. J. Numer. Methods Eng. 8,
-    461-480). Where two materials meet the stress jumps, and this is a mean of both sides. At a node that no solid
-    reaches it is zero.
-
-    Raises:
-        ValueError: if the scene has no solid, or a solid has quadrature points of a rule that is not in
-            `jaxbeam.mesh.elements`.
-    """
-    x = placed(scene, x)
-    total, area = jnp.zeros((len(x), 2, 2), x.dtype), jnp.zeros(len(x), x.dtype)
-    for term, stress in _at_points(scene, x, _stress):
-        recover = jnp.asarray(points_to_nodes(element_of(term.nodes), stress.shape[1]), x.dtype)
-        areas = jnp.sum(term.params.weights, axis=1)
-        total = total.at[term.nodes].add(jnp.einsum("kq,mqij,m->mkij", recover, stress, areas))
-        area = area.at[term.nodes].add(areas[:, None])
-    return total / jnp.where(area > 0, area, 1)[:, None, None]
+    return over_elements(scene, x, stress_of)
 
 
 @one_program
@@ -169,15 +143,15 @@ def strain_energy(scene: Scene, x: jax.Array) -> jax.Array:
 @one_program
 def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
     """`J = det F` `(t,)` of each element of the solid, averaged over its quadrature points."""
-    return _over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))
+    return over_elements(scene, x, lambda H, density, material: jnp.linalg.det(H + jnp.eye(2, dtype=H.dtype)))
 
 
-def _stress(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> jax.Array:
+def stress_of(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> jax.Array:
     F = H + jnp.eye(2, dtype=H.dtype)
     return jax.grad(density)(H, material) @ F.T / jnp.linalg.det(F)
 
 
-def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
+def at_points_of(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> list[tuple[Term, jax.Array]]:
     """For each solid, `measure(H, density, material)` at the quadrature points of its elements, `(m, q, ...)`."""
     x = placed(scene, x)
     asked = [(term, term.kind.at_points(x[term.nodes], term.params, measure)) for term in scene.terms]
@@ -187,19 +161,10 @@ def _at_points(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) ->
     return found
 
 
-def _over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
+def over_elements(scene: Scene, x: jax.Array, measure: Callable[..., jax.Array]) -> jax.Array:
     """`measure(H, density, material)` on every element of the solids, averaged with the quadrature weights."""
     mean = jax.vmap(lambda weights, values: jnp.tensordot(weights / jnp.sum(weights), values, axes=1))
-    return jnp.concatenate([mean(term.params.weights, values) for term, values in _at_points(scene, x, measure)])
-
-
-def points_to_nodes(element: Element, points: int) -> np.ndarray:
-    """The matrix `(k, q)` from values at `q` quadrature points to those of the field that fits them best, at the `k`
-    nodes of the element. The field is linear in the weights of the corners. Too few points do not fix it: of those
-    that fit the least is taken, which for one point is constant."""
-    places, shares = element.rule(element.degree_of(points))
-    root = np.sqrt(shares)
-    return element.places @ (np.linalg.pinv(root[:, None] * places) * root)
+    return jnp.concatenate([mean(term.params.weights, values) for term, values in at_points_of(scene, x, measure)])
 
 
 def _measured(scene: Scene, x: jax.Array, name: str, shape: tuple[int, ...] = ()) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Stress out of the plane, von Mises stress and principal stretches of each element of the solids.
+"""Stress out of the plane, von Mises stress, stretches and energy density of each element of the solids.
 
 Each takes the scene and node positions `x` `(n, 2)`, is pure, differentiable in both, and runs under `jit` and `vmap`.
 Values are means over the quadrature points of an element, in the order of the terms, as those of `cauchy_stress`.
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxbeam.core.compiling import one_program
 from jaxbeam.physics.plane_strain import out_of_plane
-from jaxbeam.scene.measures import _over_elements, _stress
+from jaxbeam.scene.measures import over_elements, stress_of
 from jaxbeam.scene.scene import Scene
 
 
@@ -28,7 +28,7 @@ def out_of_plane_stress(scene: Scene, x: jax.Array) -> jax.Array:
         ValueError: if `x` has another shape, the scene has no solid, or a solid has a density of your own: the energy
             in the plane does not tell this stress.
     """
-    return _over_elements(scene, x, lambda H, density, material: out_of_plane(density)(H, material))
+    return over_elements(scene, x, lambda H, density, material: out_of_plane(density)(H, material))
 
 
 @one_program
@@ -43,12 +43,7 @@ def von_mises_stress(scene: Scene, x: jax.Array) -> jax.Array:
         ValueError: as `out_of_plane_stress` does.
     """
 
-    def measure(H: jax.Array, density: Any, material: Any) -> jax.Array:
-        s, zz = _stress(H, density, material), out_of_plane(density)(H, material)
-        xx, yy, shear = s[0, 0], s[1, 1], 0.5 * (s[0, 1] + s[1, 0])
-        return _root(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * shear**2)
-
-    return _over_elements(scene, x, measure)
+    return over_elements(scene, x, lambda *point: von_mises(stress_with_normal(*point)))
 
 
 @one_program
@@ -69,7 +64,31 @@ def principal_stretches(scene: Scene, x: jax.Array) -> jax.Array:
         q, r = _root((2 + a + d) ** 2 + (c - b) ** 2), _root((a - d) ** 2 + (b + c) ** 2)
         return 0.5 * jnp.stack([q + r, q - r])
 
-    return _over_elements(scene, x, measure)
+    return over_elements(scene, x, measure)
+
+
+@one_program
+def strain_energy_density(scene: Scene, x: jax.Array) -> jax.Array:
+    """Elastic energy `(t,)` of each element of the solid by its area at rest, in the unit of stress.
+
+    Unlike `strain_energy` it does not depend on the size of the elements.
+
+    Raises:
+        ValueError: if `x` has another shape, or the scene has no solid.
+    """
+    return over_elements(scene, x, lambda H, density, material: density(H, material))
+
+
+def stress_with_normal(H: jax.Array, density: Any, material: Any) -> jax.Array:
+    """Cauchy stresses `s_xx, s_yy, s_xy, s_zz` `(4,)` at a point."""
+    s = stress_of(H, density, material)
+    return jnp.stack([s[0, 0], s[1, 1], 0.5 * (s[0, 1] + s[1, 0]), out_of_plane(density)(H, material)])
+
+
+def von_mises(stress: jax.Array) -> jax.Array:
+    """Von Mises stress `()` of the stresses `(4,)` of `stress_with_normal`."""
+    xx, yy, shear, zz = stress
+    return _root(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * shear**2)
 
 
 def _root(value: jax.Array) -> jax.Array:

@@ -35,7 +35,7 @@ import numpy as np
 from jaxbeam.core.tree import index_field, pytree
 from jaxbeam.mesh.elements import element_of
 from jaxbeam.physics.energy import Term
-from jaxbeam.scene.measures import points_to_nodes
+from jaxbeam.scene.nodal import points_to_nodes
 from jaxbeam.scene.scene import Scene
 
 # Share of its stiffness at rest below which the surface may crease. Above it, coarse and fine meshes agreed in all

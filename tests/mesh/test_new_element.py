@@ -13,7 +13,7 @@ from jaxbeam.mesh.refinement import refined
 from jaxbeam.mesh.surface import surface
 from jaxbeam.physics.volume import admissible_step, smallest_ratios
 from jaxbeam.plot import beam
-from jaxbeam.scene.measures import nodal_stress
+from jaxbeam.scene.nodal import nodal_stress
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -203,7 +203,8 @@ def test_nothing_that_acts_costs_nothing(monkeypatch):
     """No artist is made, the scene is not commanded for each state, and limits are those of the body."""
     scene = jb.tendon_beam(5, 3)
     monkeypatch.setattr("jaxbeam.plot.acting.command", None)
-    acting = Acting(scene, np.stack([scene.mesh.nodes] * 3), np.ones((3, 2)))
-    assert not acting.forces and not acting.names and not sum(np.size(points) for points in acting.extremes())
+    acting = Acting(scene)
+    seen = acting.see_all(np.ones((3, 2)), np.stack([scene.mesh.nodes] * 3))
+    assert not acting.any and not acting.names and not acting.extremes(seen)
     ax = plot.beam(scene, scene.mesh.nodes)
     assert len(ax.collections) == 6

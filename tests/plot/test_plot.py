@@ -557,8 +557,10 @@ def test_errors_name_the_argument(scene, states):
         plot.beam(scene, jb.Solution(*[scene.mesh.nodes] * len(dataclasses.fields(jb.Solution))))
     with pytest.raises(ValueError, match="x: some positions are not finite"):
         plot.beam(scene, np.full((21, 2), np.nan))
-    with pytest.raises(ValueError, match=r"values: expected shape \(24,\), one for each element, got \(21,\)"):
-        plot.field(scene, scene.mesh.nodes, np.zeros(21), "")
+    with pytest.raises(
+        ValueError, match=r"values: expected shape \(21,\), one for each node or \(24,\), .*, got \(22,\)"
+    ):
+        plot.field(scene, scene.mesh.nodes, np.zeros(22), "")
     with pytest.raises(ValueError, match="values: element 5 is not finite"):
         plot.field(scene, scene.mesh.nodes, np.where(np.arange(24) == 5, np.inf, 0.0), "")
     with pytest.raises(ValueError, match=r"commands: expected shape \(s, 2\), a row for each state, got \(5,\)"):
