@@ -19,10 +19,11 @@ from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene, command_count, command_units, commanded_terms, rest_commands
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
+from jaxbeam.solve.solution import Solution
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure
 from jaxbeam.study.optimum import Answer, Problem, move_answer
-from jaxbeam.study.search import SearchState, Task, Trial, search
+from jaxbeam.study.search import Known, SearchState, Task, Trial, search
 
 # ------------------------------------------------------------------------------------------------ reach
 
@@ -37,7 +38,7 @@ def reach(
     measure: Measure = tip_angle,
     *,
     bounds: tuple[Numbers, Numbers] | None = None,
-    starts: Numbers | None = None,
+    starts: Numbers | Solution | None = None,
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
@@ -57,7 +58,9 @@ def reach(
         measure: `(scene, x)` to `()` or `(p,)`, such as `tip_angle` (degrees), `tip_position` (length), or a
             function of your own at module level. Components are weighed as they are: scale those of different units.
         bounds: lowest and highest command, each `()` or `(m,)`; by default 0.4 and 1 for ratios of tendons.
-        starts: `(S, m)` commands to start from; by default those at rest, which are ratios of 1 for tendons.
+        starts: `(S, m)` commands to start from; by default those at rest, which are ratios of 1 for tendons. Or a
+            `Solution` of the scene, such as `solution` of an earlier answer: the search goes on from its state, and so
+            stays on its branch. Two or three solves are left to take if the new target is near.
         tolerance: largest deviation from the target that counts as reached, in the unit of the target; by default 1e-8,
             in float32 1e-3.
         max_solves: largest number of equilibria to solve from each start.
@@ -100,7 +103,7 @@ def reach_each(
     measure: Measure = tip_angle,
     *,
     bounds: tuple[Numbers, Numbers] | None = None,
-    starts: Numbers | None = None,
+    starts: Numbers | Solution | None = None,
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
@@ -130,12 +133,12 @@ def reach_each(
 def _problem(
     scene: Scene,
     bounds: tuple[Numbers, Numbers] | None,
-    starts: Numbers | None,
+    starts: Numbers | Solution | None,
     tolerance: float | None,
     max_solves: int,
     solver: Newton,
 ) -> tuple[Problem, Any]:
-    """The checked problem, and the commands `(S, m)` to start from."""
+    """The checked problem, and the commands `(S, m)` or the state to start from."""
     check_scene_and_solver(scene, solver)
     checks.count("max_solves", max_solves, 1)
     check_held(scene)
@@ -168,11 +171,25 @@ def _problem(
                 raise ValueError(
                     f"bounds: expected {floor}low <= high, got low {low.tolist()} and high {high.tolist()}"
                 )
+    problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
+    if isinstance(starts, Solution):
+        return problem, _known(scene, starts, count)
     begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)
     if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
         raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
-    problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
     return problem, begin
+
+
+def _known(scene: Scene, start: Solution, count: int) -> Known:
+    """The state of a solution, to start from."""
+    if np.shape(start.ratios) != (count,) or np.shape(start.x) != scene.mesh.nodes.shape:
+        raise ValueError(
+            f"starts: expected a Solution of one state of this scene, with commands ({count},) and positions "
+            f"{scene.mesh.nodes.shape}, got {np.shape(start.ratios)} and {np.shape(start.x)}"
+        )
+    if is_concrete(start.status) and int(start.status):
+        raise ValueError(f"starts: expected a Solution whose status is OK, got {start!r}; give commands instead")
+    return Known(start.ratios, start.x)
 
 
 def _known_or_traced(name: str, target: Numbers) -> Any:
@@ -237,8 +254,8 @@ def _on_host(
     max_solves: int,
     solver: Newton,
     progress: Callable[[int, float], None] | None,
-) -> tuple[Task, np.ndarray, np.ndarray]:
-    """The task (its target still empty), the targets `(T, ...)` and the starts `(S, m)`, with values on the host.
+) -> tuple[Task, np.ndarray, Any]:
+    """The task (its target still empty), the targets `(T, ...)` and the starts, with values on the host.
 
     Raises:
         ValueError: if a value is traced by anything but derivatives.
@@ -269,10 +286,14 @@ def _on_host(
         solver=solver,
         report=lambda distance: progress(next(count), distance) if progress else None,
     )
-    return task, np.asarray(goals, float), np.clip(np.asarray(starts, float) / unit, low, high)
+    if isinstance(starts, Known):
+        starts = Known(np.asarray(starts.commands), starts.x)
+    else:
+        starts = np.clip(np.asarray(starts, float) / unit, low, high)
+    return task, np.asarray(goals, float), starts
 
 
-def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[Design]:
+def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray | Known) -> list[Design]:
     """The design of each of the targets `(T, ...)`. Each search but the first starts from the answer before."""
     before: Trial | None = None
     designs = []
@@ -284,8 +305,10 @@ def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray) -> list[De
     return designs
 
 
-def _search_all(task: Task, begin: np.ndarray) -> SearchState:
-    """The best answer from all the starts `(S, m)`."""
+def _search_all(task: Task, begin: np.ndarray | Known) -> SearchState:
+    """The best answer from all the starts: commands `(S, m)`, or a state."""
+    if isinstance(begin, Known):
+        return search(task, begin)
     found = [_search_twice(task, theta) for theta in begin]
 
     def rank(state: SearchState) -> tuple[bool, float, float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -110,6 +110,13 @@ class Trial(NamedTuple):
         return int(self.solution.status) == 0 and bool(np.isfinite(self.slope).all() and np.isfinite(self.bend).all())
 
 
+class Known(NamedTuple):
+    """A state that a search starts from: commands `(m,)` as the scene takes them, and positions `(n, d)`."""
+
+    commands: Any
+    x: Any
+
+
 @dataclasses.dataclass
 class SearchState:
     """The state of a search.
@@ -146,7 +153,7 @@ class SearchState:
     status: DesignStatus = DesignStatus.NOT_CONVERGED
 
 
-def search(task: Task, start: np.ndarray | Trial) -> SearchState:
+def search(task: Task, start: np.ndarray | Trial | Known) -> SearchState:
     """Search by sequential quadratic programming.
 
     A command without an effect, to first and second order, may have one elsewhere: its tendon may be slack here, or the
@@ -155,11 +162,16 @@ def search(task: Task, start: np.ndarray | Trial) -> SearchState:
 
     Args:
         task: what to search for.
-        start: commands `(m,)`, which are approached from rest, or the trial of another target to start from.
+        start: commands `(m,)`, which are approached from rest; or a known state, or the trial of another target.
     """
     m = task.rest.size
     state = SearchState(step=np.zeros(m), held=np.zeros(m, np.int32), seen=np.zeros(m, bool))
-    trial = start._replace(task=task) if isinstance(start, Trial) else _tried(task, state, start, None)
+    if isinstance(start, Trial):
+        trial = start._replace(task=task)
+    elif isinstance(start, Known):
+        trial = _tried(task, state, np.clip(start.commands / task.unit, task.low, task.high), start)
+    else:
+        trial = _tried(task, state, start, None)
     while True:
         state.last = trial
         _judge(task, state, trial)
@@ -177,16 +189,18 @@ def search(task: Task, start: np.ndarray | Trial) -> SearchState:
     return state
 
 
-def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
+def solve_trial(task: Task, theta: np.ndarray, before: Trial | Known | None) -> Trial:
     """The equilibrium under commands `theta` `(m,)`, and the measure around it.
 
-    The solve is approached from the trial `before`, along its drift, or from rest if there is none.
+    The solve is approached from the state `before`, along its drift if that is known, or from rest if there is none.
     """
     dtype, linear = task.scene.mesh.nodes.dtype, task.solver.linear
     theta, commands = theta.astype(dtype), (theta * task.unit).astype(dtype)
     scene = unlock(command(task.scene, commands))
     if before is None:
         origin = from_rest(scene)
+    elif isinstance(before, Known):
+        origin = from_neighbour(before.commands.astype(dtype), before.x, np.zeros(before.x.shape, dtype))
     else:
         ahead = before.drift @ (theta - before.theta)
         origin = from_neighbour((before.theta * task.unit).astype(dtype), before.solution.x, ahead.astype(dtype))
@@ -197,7 +211,7 @@ def solve_trial(task: Task, theta: np.ndarray, before: Trial | None) -> Trial:
     return Trial(task, theta.astype(float), solution, value, slope, bend, drift)
 
 
-def _tried(task: Task, state: SearchState, theta: np.ndarray, before: Trial | None) -> Trial:
+def _tried(task: Task, state: SearchState, theta: np.ndarray, before: Trial | Known | None) -> Trial:
     """Solve a new trial, and record it in the state."""
     trial = solve_trial(task, theta, before)
     state.solves += 1

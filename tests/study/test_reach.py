@@ -333,6 +333,43 @@ def test_starts(many):
     assert effort(together) <= effort(jb.reach(many, 8.0, bounds=(0.3, 1.0))) + 1e-9
 
 
+def test_a_search_goes_on_from_an_earlier_answer(beam):
+    """Targets one by one, each from the answer before, give what the whole sequence gives, in few solves each."""
+    targets = [[1.5, 0.3], [1.45, 0.4], [1.42, 0.45]]
+    whole = jb.reach_each(beam, targets, jb.tip_position)
+    found = jb.reach(beam, targets[0], jb.tip_position)
+    for k, target in enumerate(targets):
+        found = jb.reach(beam, target, jb.tip_position, starts=found.solution)
+        assert int(found.status) == REACHED and int(found.solves) <= 5
+        np.testing.assert_allclose(found.theta, whole.theta[k], atol=1e-6)
+
+
+def test_a_search_stays_on_the_branch_that_it_starts_from():
+    """A slender beam with tendons from end to end buckles up or down; pulled more at the top it can still hang down."""
+    mesh = jb.rectangle(4.0, 0.3, 21, 3, diagonals="mirrored")
+    ends = [[jb.nearest_node(mesh, (x, y)) for x in (-2.0, 2.0)] for y in (0.15, -0.15)]
+    left, right = (jb.nodes_where(mesh, lambda x, y, sign=sign: sign * x > 1.99) for sign in (-1, 1))
+    terms = jb.solid(mesh, jb.lame(1e4, 0.3)), jb.tendons(mesh, ends, 2e3)
+    beam = jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
+    pulled = jb.check(jb.equilibrium(jb.command(beam, [0.95, 0.9])))
+    hanging = jb.check(jb.equilibrium(jb.command(beam, [0.9, 0.91]), pulled.x))
+    target, bounds = float(jb.tip_angle(beam, hanging.x)) + 0.05, ([0.88, 0.905], [0.902, 0.92])
+    assert target < -18
+    assert int(jb.reach(beam, target, bounds=bounds).status) == UNREACHABLE
+    found = jb.reach(beam, target, bounds=bounds, starts=hanging)
+    assert int(found.status) == REACHED
+    assert float(jnp.abs(found.solution.x - hanging.x).max()) < 0.05
+    np.testing.assert_allclose(jb.tip_angle(beam, found.solution.x), target, atol=1e-8)
+
+
+def test_a_start_must_be_one_good_state_of_the_scene(beam):
+    pulled = jb.equilibrium(jb.command(beam, [0.8, 1.0]))
+    with pytest.raises(ValueError, match=r"starts: expected a Solution of one state of this scene, .* got \(3, 2\)"):
+        jb.reach(beam, 1.0, starts=jb.sweep(beam, np.full((3, 2), 0.9)))
+    with pytest.raises(ValueError, match="starts: expected a Solution whose status is OK"):
+        jb.reach(beam, 1.0, starts=replace(pulled, status=jnp.int32(1)))
+
+
 @pytest.mark.slow
 def test_solves_run_out(beam):
     found = jb.reach(beam, 30.0, max_solves=2)
