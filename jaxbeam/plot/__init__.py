@@ -31,3 +31,5 @@ from jaxbeam.plot.states import States as States
 from jaxbeam.plot.stills import branches as branches
 from jaxbeam.plot.stills import curves as curves
 from jaxbeam.plot.stills import gallery as gallery
+from jaxbeam.plot.window import Window as Window
+from jaxbeam.plot.window import interact as interact

@@ -52,6 +52,8 @@ LOOKS: tuple[dict[str, Any], ...] = (
     {"linestyle": "-", "linewidth": 0.8, "alpha": 0.6},
 )
 UNSTABLE = (0, (3.0, 1.8))
+# Colour and dashes of the outline in a state that cannot be trusted.
+WRONG, WRONG_DASHES = "#C1121F", (0, (4.0, 2.0))
 # Width of a figure in inches: the text width of a paper.
 PAPER = 7.2
 
@@ -110,12 +112,14 @@ class Body:
         (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
         self.artists: list[Artist] = [self.body, self.outline, self.held, *self.tendons, self.guides, self.supports]
         self.smooth: Smooth | None = None
+        self.trusted, self.bare = True, False
         if scale:
             self._colour(ax, scale)
 
     def _colour(self, ax: Axes, scale: Scale) -> None:
         """Prepare for a field in colour. A white rim keeps tendons apart from the colours below them."""
-        self.outline.set_visible(not self.rod)
+        self.bare = self.rod  # its colours are its outline
+        self.outline.set_visible(not self.bare)
         self.body.set(edgecolor="face", linewidth=5.0 if self.rod else 0.2, cmap=scale.cmap, norm=scale.norm)
         for line in self.tendons:
             line.set_path_effects([withStroke(linewidth=4.0, foreground="white")])
@@ -128,6 +132,13 @@ class Body:
     def coloured(self) -> Collection:
         """What carries the colours of a field."""
         return self.smooth.mesh if self.smooth else self.body
+
+    def mark(self, trusted: bool) -> None:
+        """Draw the outline red and dashed if the state cannot be trusted."""
+        if trusted != self.trusted:
+            style: Any = "-" if trusted else WRONG_DASHES
+            self.outline.set(color=OUTLINE if trusted else WRONG, linestyle=style, visible=not (trusted and self.bare))
+            self.trusted = trusted
 
     def move(self, x: np.ndarray, doing: np.ndarray, values: np.ndarray | None = None) -> None:
         """Draw the beam at `x` `(n, d)`.

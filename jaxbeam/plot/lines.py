@@ -15,7 +15,7 @@ from jaxbeam.mesh.element import edge_functions
 from jaxbeam.mesh.elements import ELEMENTS, element_of
 from jaxbeam.mesh.surface import surface, walk
 from jaxbeam.physics.energy import Term
-from jaxbeam.scene.scene import Scene
+from jaxbeam.scene.scene import Scene, commanded_terms
 
 # Points of a curved edge; an odd number, so that the node in the middle is one of them.
 POINTS = 9
@@ -61,6 +61,16 @@ def drawn_terms(scene: Scene) -> list[tuple[Term, np.ndarray]]:
 def line_names(scene: Scene) -> list[str]:
     """What to call each of the lines, such as `tendon 1`."""
     return [f"{term.kind.name} {number + 1}" for term, lines in drawn_terms(scene) for number in lines]
+
+
+def command_names(scene: Scene) -> list[str]:
+    """What to call each of the commands: as the line that it changes, or as its term."""
+    lines = {id(term): numbers for term, numbers in drawn_terms(scene)}
+    found = []
+    for term in commanded_terms(scene):
+        name, numbers = term.kind.name, lines.get(id(term), np.arange(term.command_count))
+        found += [name] if term.command_count == 1 != len(numbers) else [f"{name} {k + 1}" for k in numbers]
+    return [name.removesuffix(" 1") if f"{name[:-1]}2" not in found else name for name in found]
 
 
 def term_lines(scene: Scene, x: np.ndarray) -> list[np.ndarray]:

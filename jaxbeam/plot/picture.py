@@ -68,7 +68,7 @@ class Picture:
         ax: where to draw (`ax.legend()` names what is there); by default a new figure with a legend.
         bounds: axis limits, by default those that hold the beam here and at rest, and what acts on it.
 
-    The attribute `ax` holds the axes.
+    The attribute `ax` holds the axes, and `values` those of the field that are drawn, or None.
 
     Raises:
         ValueError: if `x` or the values of the field have another shape or are not finite.
@@ -90,24 +90,32 @@ class Picture:
         figure, axes = (None, [prepare(ax, bounds)]) if ax else panels(1, [bounds])
         self.scene, self.ax, self.field, self._acting = scene, axes[0], field, acting
         self._measure = jax.jit(field.values) if field and callable(field.values) else None
-        values = self._values(state, field.values if field and not self._measure else None)
-        (scale,) = scales_of(field, [(scene, values[None])]) if field and values is not None else (None,)
+        self.values = self._values(state, field.values if field and not self._measure else None)
+        (scale,) = scales_of(field, [(scene, self.values[None])]) if field and self.values is not None else (None,)
         self._panel = Panel(axes[0], acting, scale)
         doing = np.asarray(doing_of(scene, jnp.asarray(positions)))
-        self._panel.show(state, doing, values)
+        self._panel.show(state, doing, self.values)
         if field and scale:
             self._panel.add_colour_bar(field.label, scale)
         if figure:
             add_legend(figure, [acting], [doing])
             fit_height(figure, axes)
 
-    def move(self, x: Numbers, commands: Numbers | None = None, *, values: Numbers | None = None) -> Sequence[Artist]:
+    def move(
+        self,
+        x: Numbers,
+        commands: Numbers | None = None,
+        *,
+        values: Numbers | None = None,
+        trusted: bool = True,
+    ) -> Sequence[Artist]:
         """Draw the beam at `x` `(n, d)` under `commands` `(m,)`, by default those that it was made with.
 
         Args:
             x: node positions.
             commands: ratios of tendons, pressures and others.
             values: of the field in this state, if it is not one of a function.
+            trusted: if not, the outline is red and dashed: for a state whose status is not `OK`.
 
         Returns:
             The artists that moved, which `FuncAnimation(..., blit=True)` asks for.
@@ -117,10 +125,11 @@ class Picture:
         """
         scene = self.scene if commands is None else command(self.scene, commands)
         state = self._acting.see(scene, positions_of(scene, x))
-        found = self._values(state, values)
-        if self.field and found is not None:
-            scales_of(self.field, [(scene, found[None])])
-        self._panel.show(state, np.asarray(doing_of(scene, jnp.asarray(state.x))), found)
+        self.values = self._values(state, values)
+        if self.field and self.values is not None:
+            scales_of(self.field, [(scene, self.values[None])])
+        self._panel.show(state, np.asarray(doing_of(scene, jnp.asarray(state.x))), self.values)
+        self._panel.body.mark(trusted)
         return self.artists
 
     @property

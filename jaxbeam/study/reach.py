@@ -144,13 +144,25 @@ def _problem(
     check_held(scene)
     dtype = scene.mesh.nodes.dtype
     count = command_count(scene)
-    if not count:
-        raise ValueError("scene: expected at least one tendon to command, got none")
     if tolerance is None:
         tolerance = 1e-8 if jnp.finfo(dtype).eps < 1e-10 else 1e-3
     tolerance = checks.number("tolerance", tolerance, checks.POSITIVE)
-    rest = rest_commands(scene)
-    if bounds is None and (rest != 1).any():
+    low, high = command_bounds(scene, bounds)
+    problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
+    if isinstance(starts, Solution):
+        return problem, _known(scene, starts, count)
+    begin = rest_commands(scene)[None].astype(float) if starts is None else checks.numbers("starts", starts)
+    if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
+        raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
+    return problem, begin
+
+
+def command_bounds(scene: Scene, bounds: tuple[Numbers, Numbers] | None) -> tuple[Any, Any]:
+    """The lowest and the highest commands, `(m,)` each, checked; by default `RATIOS` if all are ratios of tendons."""
+    count = command_count(scene)
+    if not count:
+        raise ValueError("scene: expected at least one tendon to command, got none")
+    if bounds is None and (rest_commands(scene) != 1).any():
         raise ValueError("bounds: only ratios of tendons have default bounds; give the lowest and the highest commands")
     bounds = RATIOS if bounds is None else bounds
     if not isinstance(bounds, tuple | list) or len(bounds) != 2:
@@ -161,7 +173,7 @@ def _problem(
         if end.shape not in ((), (count,)):
             raise ValueError(f"bounds: expected {name} of shape () or ({count},), got {end.shape}")
         xp = namespace(end)
-        ends.append(to_device(xp.broadcast_to(xp.asarray(end, dtype), (count,))))
+        ends.append(to_device(xp.broadcast_to(xp.asarray(end, scene.mesh.nodes.dtype), (count,))))
     low, high = ends
     if is_concrete(low, high):
         ranges = [term.kind.commands for term in commanded_terms(scene) for _ in range(term.command_count)]
@@ -171,13 +183,7 @@ def _problem(
                 raise ValueError(
                     f"bounds: expected {floor}low <= high, got low {low.tolist()} and high {high.tolist()}"
                 )
-    problem = Problem(scene, solver.linear.layout(topology(scene)), low, high, jnp.asarray(tolerance, dtype))
-    if isinstance(starts, Solution):
-        return problem, _known(scene, starts, count)
-    begin = rest[None].astype(float) if starts is None else checks.numbers("starts", starts)
-    if begin.ndim != 2 or begin.shape[1] != count or not begin.shape[0]:
-        raise ValueError(f"starts: expected shape (S, {count}), a row for each start, got {begin.shape}")
-    return problem, begin
+    return low, high
 
 
 def _known(scene: Scene, start: Solution, count: int) -> Known:
