@@ -142,16 +142,32 @@ def _selected(predicate: Callable[..., Any], points: np.ndarray, what: str) -> n
     return np.flatnonzero(mask)
 
 
-def nearest_node(mesh: Mesh, point: Numbers) -> int:
-    """Number of the node nearest to `point` `(2,)` at rest; of nodes equally near, the lowest number.
+def nearest_node(mesh: Mesh, point: Numbers) -> Any:
+    """Number of the node nearest to a point at rest; of nodes equally near, the lowest number.
+
+    Args:
+        mesh: with known nodes.
+        point: `(2,)`, or `(..., 2)` for many: `nearest_node(mesh, [[(0, 1), (2, 1)], [(0, 0), (2, 0)]])` gives the
+            nodes `(2, 2)` of two tendons.
+
+    Returns:
+        An int, or `(...)` node numbers for many points.
 
     Raises:
-        ValueError: if the point is not two finite numbers, or the nodes are traced.
+        ValueError: if a point is not two finite numbers, or the nodes are traced.
+
+    >>> import jaxbeam as jb
+    >>> nearest_node(jb.rectangle(2.0, 1.0, 3, 2), [[-1.0, 0.5], [0.1, 0.4]]).tolist()
+    [1, 3]
     """
     if not is_concrete(point):
-        raise ValueError("point: expected two known coordinates, got traced ones; select nodes outside jit and grad")
-    target = checks.numbers("point", point, shapes=((2,),))
-    return int(np.argmin(np.sum((_concrete_nodes(mesh) - target) ** 2, axis=1)))
+        raise ValueError("point: expected known coordinates, got traced ones; select nodes outside jit and grad")
+    target = checks.numbers("point", point)
+    if target.ndim == 0 or target.shape[-1] != 2:
+        raise ValueError(f"point: expected shape (2,), or (..., 2) for many points, got {target.shape}")
+    nodes = _concrete_nodes(mesh)
+    found = [int(np.argmin(np.sum((nodes - each) ** 2, axis=1))) for each in target.reshape(-1, 2)]
+    return found[0] if target.ndim == 1 else np.array(found, np.int32).reshape(target.shape[:-1])
 
 
 def pieces(elements: np.ndarray, count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Key, Numbers, is_concrete, key_of, namespace, read_only
 from jaxbeam.mesh.element import edge_rule, edge_slopes
 from jaxbeam.mesh.elements import element_of
-from jaxbeam.mesh.mesh import Mesh, check_triangles
+from jaxbeam.mesh.mesh import Mesh, check_triangles, nearest_node
 from jaxbeam.mesh.surface import surface_of
 
 # Points of Gauss's rule on each piece of an edge from one node to the next. The length of a straight piece is exact.
@@ -70,7 +70,7 @@ def _loops(body: Key) -> tuple[np.ndarray, ...]:
     return tuple(loops)
 
 
-def side(mesh: Mesh, start: int, end: int) -> np.ndarray:
+def side(mesh: Mesh, start: Numbers, end: Numbers) -> np.ndarray:
     """A side of the body: the nodes of the surface from `start` to `end`, with the body on the left.
 
     This is counter-clockwise around a body, and clockwise around a hole. The upper side of a `rectangle` runs from its
@@ -78,8 +78,8 @@ def side(mesh: Mesh, start: int, end: int) -> np.ndarray:
 
     Args:
         mesh: of triangles; its nodes may be traced.
-        start: number of a node on the surface, such as `nearest_node(mesh, point)`.
-        end: number of a node on the same closed line of the surface. If it is `start`, the side is all of that line.
+        start: number of a node on the surface, or a point `(2,)` at rest that stands for the nearest node.
+        end: the same, on the same closed line of the surface. If it is `start`, the side is all of that line.
 
     Returns:
         `(k,)` node numbers in order, corners and nodes between them, both ends included.
@@ -91,13 +91,15 @@ def side(mesh: Mesh, start: int, end: int) -> np.ndarray:
     >>> import jaxbeam as jb
     >>> side(jb.rectangle(2.0, 1.0, 3, 2), 5, 1).tolist()
     [5, 3, 1]
+    >>> side(jb.rectangle(2.0, 1.0, 3, 2), (1.0, 0.5), (-1.0, 0.5)).tolist()
+    [5, 3, 1]
     """
     check_triangles(mesh)
     loops = surface_lines(mesh)
     (first, place), (second, last) = (_on_surface(name, mesh, loops, n) for name, n in (("start", start), ("end", end)))
     if first != second:
         raise ValueError(
-            f"end: expected a node of the closed line of the surface that node {start} is on, got {end}, which is on "
+            f"end: expected a node of the closed line of the surface that {start} is on, got {end}, which is on "
             f"another one; choose both from one of surface_lines(mesh)"
         )
     length = (last - place) % len(loops[first])
@@ -108,6 +110,7 @@ def _on_surface(name: str, mesh: Mesh, loops: list[np.ndarray], value: Any) -> t
     """Which of the closed lines of the surface a node is on, and its place there."""
     if not is_concrete(value):
         raise ValueError(f"{name}: expected a node number, got a traced value; choose nodes outside jit and grad")
+    value = nearest_node(mesh, value) if np.shape(value) == (2,) else value
     node = checks.count(name, value.item() if getattr(value, "shape", None) == () else value, 0)
     if node >= len(mesh.nodes):
         raise ValueError(f"{name}: {node} is out of range, nodes are numbered 0 to {len(mesh.nodes) - 1}")

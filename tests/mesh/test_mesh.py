@@ -240,6 +240,9 @@ def test_nearest_is_nearest(irregular):
         chosen = jb.nearest_node(irregular, point)
         distance = np.hypot(*(np.asarray(irregular.nodes) - point).T)
         assert distance[chosen] == distance.min()
+    many = np.random.default_rng(1).uniform(-1, 1, (3, 4, 2))
+    each = [[jb.nearest_node(irregular, point) for point in row] for row in many]
+    np.testing.assert_array_equal(jb.nearest_node(irregular, many), each)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +258,7 @@ def test_selection_refuses(predicate, message):
         jb.nodes_where(jb.rectangle(2.0, 1.0, 3, 2), predicate)
 
 
-@pytest.mark.parametrize("point", [[0.0], [0.0, np.nan], [[0.0, 0.0]], 1.0])
+@pytest.mark.parametrize("point", [[0.0], [0.0, np.nan], [[0.0, 0.0, 1.0]], 1.0])
 def test_nearest_refuses(point):
     with pytest.raises(ValueError, match=r"point: expected (shape|finite)"):
         jb.nearest_node(jb.rectangle(2.0, 1.0, 3, 2), point)

@@ -120,7 +120,7 @@ TOUCHING, CENTRE = touching()
         (FLAT, 0, 15, r"end: 15 is out of range, nodes are numbered 0 to 14"),
         (FLAT, -1, 0, r"start: expected a whole number of at least 0, got -1"),
         (FLAT, 0.5, 0, r"start: expected a whole number"),
-        (annulus(), 0, 2, r"end: expected a node of the closed line of the surface that node 0 is on, got 2"),
+        (annulus(), 0, 2, r"end: expected a node of the closed line of the surface that 0 is on, got 2"),
         (TOUCHING, CENTRE, 0, r"start: .*: the surface passes through it more than once"),
         (jb.rod_beam(3).mesh, 0, 1, r"mesh: expected triangles, got the Line of a rod"),
     ],
