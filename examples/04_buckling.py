@@ -50,12 +50,7 @@ SOLVER = jb.Newton(escape=False)
 
 def trace(scene: jb.Scene, **start: Any) -> jb.Branch:
     """A branch towards `END`, up to where it would go on with an element turned inside out."""
-
-    def progress(count: int, s: float) -> None:
-        if count % 25 == 0:
-            print(f"  {count} points, ratio {1 + s * (END[0] - 1):.4f}", flush=True)
-
-    branch = jb.trace_branch(scene, END, solver=SOLVER, progress=progress, **start)
+    branch = jb.trace_branch(scene, END, solver=SOLVER, progress=True, **start)
     inverted = np.flatnonzero(branch.smallest_jacobian <= 0)
     end = int(inverted[0]) if inverted.size else len(branch.x)
     names = ("parameter", "ratios", "x", "negative", "residual", "smallest_jacobian", "overlapping")

@@ -124,7 +124,7 @@ def main(out: Path) -> dict[str, float]:
     direct = jb.reach(scene, COMPARED, bounds=(LOW, HIGH))
     print(line("reach", int(direct.solves), float(direct.loss)))
     for name, optimiser, steps in [("optax.lbfgs", optax.lbfgs(), 50), ("optax.adam", optax.adam(0.1), 200)]:
-        design = jb.minimise(deviation, np.full(2, 2.0), optimiser, steps, design=commanded, goal=1e-16)
+        design = jb.minimise(deviation, np.full(2, 2.0), optimiser, steps, design=commanded, goal=1e-16, progress=True)
         print(line(name, int(design.solves), float(design.loss) ** 0.5))
 
     print("\ndrawing fan.png and commands.png ...", flush=True)

@@ -119,12 +119,12 @@ def main(out: Path) -> dict[str, float]:
     scene, targets = jb.tendon_beam(NX, NY, LENGTH), figure_of_eight()
     print(f"mapping what the tip can reach, {GRID**2} commands ...", flush=True)
     ratios = np.stack(np.meshgrid(*[np.linspace(*BOUNDS, GRID)] * 2, indexing="ij"), axis=-1)
-    swept = jb.check(jb.sweep(scene, ratios.reshape(-1, 2)))
+    swept = jb.check(jb.sweep(scene, ratios.reshape(-1, 2), progress=True))
     tip = jax.jit(jax.vmap(lambda x: jb.tip_position(scene, x)))
     region = np.asarray(tip(swept.x)).reshape(GRID, GRID, 2)
 
     print(f"following {POINTS} points (compiles first) ...", flush=True)
-    path = jb.reach_each(scene, targets, jb.tip_position, bounds=BOUNDS)
+    path = jb.reach_each(scene, targets, jb.tip_position, bounds=BOUNDS, progress=True)
     jb.check(path.solution)
     error = np.linalg.norm(path.value - targets, axis=1) / LENGTH
     tension = jax.jit(jax.vmap(lambda r, x: jb.tendon_tensions(jb.command(scene, r), x)))(path.theta, path.solution.x)

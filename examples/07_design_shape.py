@@ -136,7 +136,7 @@ def main(out: Path) -> dict[str, float]:
     before = (design(theta), ramp.x[best])
 
     print("designing (compiles first) ...", flush=True)
-    found = jb.minimise(distance, theta, optax.lbfgs(), 60, design=design, goal=GOAL**2)
+    found = jb.minimise(distance, theta, optax.lbfgs(), 60, design=design, goal=GOAL**2, progress=True)
     jb.check(found.solution)
     after, history = (design(found.theta), found.solution.x), np.asarray(found.history.loss)
     if int(found.status) != jb.DesignStatus.REACHED:

@@ -16,7 +16,6 @@ fingerprint shows. The first process draws.
 
 import argparse
 import hashlib
-import sys
 import time
 from pathlib import Path
 
@@ -67,14 +66,10 @@ def main(out: Path, side: int = 64) -> dict[str, float]:
     values = np.linspace(LOW, HIGH, side)
     ratios = np.stack([a.ravel() for a in np.meshgrid(values, values, indexing="ij")], axis=1)
     first = jax.process_index() == 0
-
-    def progress(done: int, total: int) -> None:
-        print(f"\r{done} of {total} commands of this process", end="\n" if done == total else "", file=sys.stderr)
-
     if first:
         print(f"{len(ratios)} commands on {jax.process_count()} process(es) (the first chunk compiles) ...", flush=True)
     start = time.perf_counter()
-    found = jb.sweep(scene, ratios, progress=progress)
+    found = jb.sweep(scene, ratios, progress=first)
     seconds = time.perf_counter() - start
     x, bad = np.asarray(found.x), np.asarray(found.status) != 0
     fingerprint = hashlib.sha256(x.tobytes()).hexdigest()[:16]

@@ -142,7 +142,7 @@ def main(out: Path = Path("out/speed_against_accuracy")) -> dict[str, float]:
         choice = jb.choose(error)
         print(f"within {100 * error:g} %: {choice.name}, expected error {100 * choice.error:.2g} %")
     coarse = jb.command(jb.tendon_beam(7, 3, order=2, anchor_width=WIDTH, **NEAR), RATIOS)
-    answer = jb.solve_to(coarse, jb.tip_angle, 0.01)
+    answer = jb.solve_to(coarse, jb.tip_angle, 0.01, progress=True)
     count = np.count_nonzero(~answer.scene.fixed)
     print(f"to 0.01 degrees: {answer.value:.4f} +- {answer.estimate.bar:.4f} with {count} unknowns")
     held = [p.error <= p.bar for p in points if p.bar is not None]

@@ -77,7 +77,7 @@ def main(out: Path) -> dict[str, float]:
     """Solve, print, draw into the folder `out`; return the commands, and how near the curled tip comes."""
     out.mkdir(parents=True, exist_ok=True)
     print("searching the commands of the posture (the first time compiles) ...", flush=True)
-    found = jb.reach(SCENE, POSTURE, posture, bounds=BOUNDS)
+    found = jb.reach(SCENE, POSTURE, posture, bounds=BOUNDS, progress=True)
     if found.status != jb.DesignStatus.REACHED or np.abs(found.value - POSTURE).max() > 1e-6:
         raise RuntimeError(f"the posture was missed: {found}")
     curled = jb.command(SCENE, found.theta)
@@ -94,7 +94,7 @@ def main(out: Path) -> dict[str, float]:
     print("\nand with one cable alone, and of a tip that curls on its own ...", flush=True)
     alone = jb.check(jb.equilibrium(jb.command(SCENE, [1.0, 1.0, 0.75])))
     print("  third cable alone ", "  ".join(f"{float(value):9.4f}" for value in posture(SCENE, alone.x)), "degrees")
-    nearest = jb.reach(SCENE, CURLED_TIP, posture, bounds=BOUNDS)
+    nearest = jb.reach(SCENE, CURLED_TIP, posture, bounds=BOUNDS, progress=True)
     missed = float(np.linalg.norm(nearest.value - CURLED_TIP))
     print(f"  {jb.DesignStatus(int(nearest.status)).name}, {missed:.1f} degrees away")
 

@@ -73,7 +73,7 @@ def main(out: Path) -> dict[str, float]:
     out.mkdir(parents=True, exist_ok=True)
     scene, targets = tentacle(), figure_of_eight()
     print(f"following {POINTS} points (compiles first) ...", flush=True)
-    path = jb.reach_each(scene, targets, jb.tip_position, bounds=BOUNDS, starts=[START])
+    path = jb.reach_each(scene, targets, jb.tip_position, bounds=BOUNDS, starts=[START], progress=True)
     jb.check(path.solution)
     error, ratios = np.abs(path.value - targets).max(), np.asarray(path.theta)
     if (np.asarray(path.status) != jb.DesignStatus.REACHED).any() or error > 1e-6:

@@ -83,7 +83,7 @@ def main(out: Path) -> dict[str, float]:
     scene = gripper()
     print(f"searching the ratio that grips with {FORCE:g} (the first time compiles) ...", flush=True)
     # The second command would move the disk. Its bounds keep it where it is.
-    found = jb.reach(scene, FORCE, grip, bounds=([0.7, 0.0], [1.0, 0.0]))
+    found = jb.reach(scene, FORCE, grip, bounds=([0.7, 0.0], [1.0, 0.0]), progress=True)
     jb.check(found.solution)
     if found.status != jb.DesignStatus.REACHED or abs(float(found.value) - FORCE) > 1e-6:
         raise RuntimeError(f"the force was missed: {found}")

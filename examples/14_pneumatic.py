@@ -49,7 +49,7 @@ def main(out: Path) -> dict[str, float]:
     found, tips = {}, []
     for name, scene, within in zip(("pressure", "ratio"), beams(), ((0.0, MOST), (0.4, 1.0)), strict=True):
         print(f"searching the {name} that turns the tip by {TURN:g} degrees (compiles first) ...", flush=True)
-        design = jb.reach(scene, TURN, jb.section_rotation, bounds=within)
+        design = jb.reach(scene, TURN, jb.section_rotation, bounds=within, progress=True)
         jb.check(design.solution)
         if design.status != jb.DesignStatus.REACHED or abs(float(design.value) - TURN) > 1e-6:
             raise RuntimeError(f"the angle was missed: {design}")

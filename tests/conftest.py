@@ -3,6 +3,7 @@
 import gc
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 # Before JAX is imported: both processes of the tests, and the scripts they start, compile each program once.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
@@ -12,6 +13,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax
 import pytest
+from helpers import Terminal
 
 import jaxbeam as jb
 from jaxbeam.core.compiling import COMPILER_OPTIONS
@@ -34,6 +36,15 @@ jax.config.update("jax_enable_x64", True)
 # Python's search for reference cycles takes a tenth of the time of tracing. What is loaded now stays anyway.
 gc.freeze()
 gc.set_threshold(100_000, 50, 1000)
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Stderr as a terminal; `getvalue()` is what was written to it."""
+    stream = Terminal()
+    # Not `sys.stderr` itself: pytest sets that anew before each test.
+    monkeypatch.setattr("jaxbeam.core.progress.sys", SimpleNamespace(stderr=stream))
+    return stream
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
 import subprocess
 import sys
@@ -23,6 +24,24 @@ from tests.energies import Problem
 from tests.obstacles import Contact
 
 EPS = np.finfo(np.float64).eps
+
+
+class Terminal(io.StringIO):
+    """Holds what is written to it, and passes for a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def lines(self) -> list[str]:
+        """What stands in each line at last, without spaces at its end. A carriage return goes back to its beginning."""
+        found = []
+        for line in self.getvalue().split("\n"):
+            seen = ""
+            for part in line.split("\r"):
+                seen = part + seen[len(part) :]
+            found.append(seen.rstrip())
+        return found
+
 
 # ---------------------------------------------------------------------------------------------- meshes
 

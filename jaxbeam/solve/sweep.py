@@ -25,6 +25,7 @@ from jax.sharding import PartitionSpec
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules, zeros_like_result
+from jaxbeam.core.progress import Progress, Report, check_progress
 from jaxbeam.core.tree import Numbers, T, is_concrete, to_device, unlock
 from jaxbeam.linear.layout import Layout, expand, gather
 from jaxbeam.scene.evaluation import energy
@@ -55,7 +56,7 @@ def sweep(
     scene: Scene,
     ratios: Numbers,
     solver: Newton = Newton(),
-    progress: Callable[[int, int], None] | None = None,
+    progress: bool | Callable[[int, int], None] | None = None,
 ) -> Solution:
     """The equilibrium of each of many commands.
 
@@ -71,8 +72,9 @@ def sweep(
         scene: with `m` tendons.
         ratios: `(B, m)`, positive.
         solver: settings of each solve.
-        progress: called as `progress(solved, all)` after each chunk, with the number of commands that this process
-            has solved and the number of all its commands. Not called inside jit.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            chunk, as `progress(solved, all)`, with the number of commands that this process has solved and the number
+            of all its commands. Inside jit there is no progress.
 
     Returns:
         A `Solution` with leading axis `B`, differentiable like that of `equilibrium`.
@@ -85,8 +87,7 @@ def sweep(
     shape = values.shape
     if len(shape) != 2 or shape[0] == 0:
         raise ValueError(f"ratios: expected shape (B, m), a row for each command, got {shape}")
-    if progress is not None:
-        checks.function("progress", progress, "(solved, all)")
+    check_progress(progress, "(solved, all)")
     check_held(scene)
     jax.eval_shape(command, scene, jax.ShapeDtypeStruct(shape[1:], scene.mesh.nodes.dtype))  # checks the count
     check_commands("ratios", scene, values)
@@ -320,7 +321,7 @@ def _on_all_cores(
     rows: np.ndarray,
     size: int,
     solver: Newton,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
 ) -> Solution:
     """The equilibria of concrete commands `rows` `(B, m)`, on every core, device and process."""
     parts = partition(rows, np.arange(len(rows)), size)
@@ -341,14 +342,16 @@ def _on_all_cores(
     # Several devices solve the chunks of one job together. To JAX the cores of a processor are a single device. There
     # each core gets a thread, which solves one job after the other.
     workers = (os.cpu_count() or 1) if len(devices) == 1 and devices[0].platform == "cpu" else 1
-    if len(jobs) > 1:
-        # An empty job compiles the program once; otherwise each thread would compile it.
-        solve([])
-    with ThreadPoolExecutor(workers) as pool:
+    total = sum(map(len, mine))
+    unit = "commands" if processes == 1 else "commands of this process"
+    with Report(progress, unit, total) as report, ThreadPoolExecutor(workers) as pool:
+        if len(jobs) > 1:
+            # An empty job compiles the program once; otherwise each thread would compile it.
+            solve([])
         for found in pool.map(solve, jobs):
             results += found
-            if progress is not None:
-                progress(sum(len(part) for part in mine[: len(results)]), sum(len(part) for part in mine))
+            solved = sum(map(len, mine[: len(results)]))
+            report(solved, call=(solved, total))
     return assembled(parts, results if processes == 1 else _gathered(results, len(parts)))
 
 

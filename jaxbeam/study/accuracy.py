@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, usual_rules
+from jaxbeam.core.progress import Report, check_progress
 from jaxbeam.core.tree import is_concrete, unlock
 from jaxbeam.linear.layout import Layout, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
@@ -130,7 +131,14 @@ def estimate_error(scene: Scene, solution: Solution, measure: Measure, solver: N
 
 
 @usual_rules
-def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_000, solver: Newton = Newton()) -> Answer:
+def solve_to(
+    scene: Scene,
+    measure: Measure,
+    tolerance: float,
+    most: int = 20_000,
+    solver: Newton = Newton(),
+    progress: bool | Callable[[int, float], None] | None = None,
+) -> Answer:
     """Solve a scene, and refine its mesh until the error bar of a measure is within a tolerance.
 
     The solve on a finer mesh starts from the positions that the error estimate on the mesh before predicts, so that two
@@ -144,6 +152,8 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
         tolerance: positive, in the unit of the measure.
         most: number of unknowns of the largest mesh to solve on.
         solver: settings of each solve.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            mesh, as `progress(meshes, bar)`, with the number of meshes so far and the error bar on the last one.
 
     Raises:
         ValueError: if the tolerance is not positive and finite, or as `estimate_error` does.
@@ -152,15 +162,18 @@ def solve_to(scene: Scene, measure: Measure, tolerance: float, most: int = 20_00
     checks.function("measure", measure, "(scene, x) -> scalar")
     tolerance = checks.setting("tolerance", tolerance, checks.POSITIVE, "it is in the unit of the measure")
     checks.count("most", most, 1)
+    check_progress(progress, "(meshes, bar)")
     rung, start = 0, None
-    while True:
-        solution = equilibrium(scene, start, solver)
-        estimate, finer, ahead = _estimate(scene, solution, measure, solver)
-        met = estimate.bar <= tolerance
-        reason = "" if met else _stop(estimate, tolerance, float(jnp.finfo(solution.x.dtype).eps), finer, most)
-        if met or reason:
-            return Answer(estimate.value, estimate, met, rung, scene, solution, reason)
-        rung, scene, start = rung + 1, finer, ahead
+    with Report(progress, "meshes") as report:
+        while True:
+            solution = equilibrium(scene, start, solver)
+            estimate, finer, ahead = _estimate(scene, solution, measure, solver)
+            report(rung + 1, f"error bar {estimate.bar:.2e}", call=(rung + 1, estimate.bar))
+            met = estimate.bar <= tolerance
+            reason = "" if met else _stop(estimate, tolerance, float(jnp.finfo(solution.x.dtype).eps), finer, most)
+            if met or reason:
+                return Answer(estimate.value, estimate, met, rung, scene, solution, reason)
+            rung, scene, start = rung + 1, finer, ahead
 
 
 def _stop(estimate: ErrorEstimate, tolerance: float, eps: float, finer: Scene, most: int) -> str:

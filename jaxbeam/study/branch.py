@@ -17,6 +17,7 @@ from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.progress import Report, check_progress
 from jaxbeam.core.tree import Numbers
 from jaxbeam.scene.evaluation import smallest_jacobian
 from jaxbeam.scene.overlap import crossing
@@ -106,7 +107,7 @@ def trace_branch(
     step: float = 0.02,
     max_points: int = 1000,
     solver: Newton = Newton(),
-    progress: Callable[[int, float], None] | None = None,
+    progress: bool | Callable[[int, float], None] | None = None,
 ) -> Branch:
     """Follow one branch of equilibria as commands, loads or other numbers change, through its folds.
 
@@ -129,7 +130,8 @@ def trace_branch(
         step: largest arclength of a step: the root of `(rms displacement / size)^2 + (change of s)^2`.
         max_points: largest number of points.
         solver: tolerance and linear solver.
-        progress: called with the number of points and `s` after each step.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            step, as `progress(points, s)`, with the number of points and `s`.
 
     Returns:
         A `Branch`.
@@ -144,16 +146,19 @@ def trace_branch(
         parameter = _check_bifurcation(scene, through, x0, parameter)
     interval, parameter, step = _check_way(direction, interval, parameter, step)
     checks.count("max_points", max_points, 1)
+    check_progress(progress, "(points, s)")
     if isinstance(ratios, Scene):
         path = path_between(scene, ratios, solver)
     else:
         path = path_between(command(scene, rest_commands(scene)), command(scene, ratios), solver)
-    if through is None:
-        x = _first_state(path, parameter, x0)
-        points = [path.advance(_start(x, parameter, np.zeros_like(x), direction), 0.0)]
-    else:
-        points = _beside(path, through, direction, step)[:max_points]
-    return _branch(path, *_walk(path, points, interval, step, max_points, progress))
+    with Report(progress, "points") as report:
+        if through is None:
+            x = _first_state(path, parameter, x0)
+            points = [path.advance(_start(x, parameter, np.zeros_like(x), direction), 0.0)]
+        else:
+            points = _beside(path, through, direction, step)[:max_points]
+        walked = _walk(path, points, interval, step, max_points, report)
+    return _branch(path, *walked)
 
 
 def _start(x: np.ndarray, s: float, dx: np.ndarray, ds: float) -> Point:
@@ -236,7 +241,7 @@ def _walk(
     interval: tuple[float, float],
     step: float,
     max_points: int,
-    progress: Callable[[int, float], None] | None,
+    report: Report,
 ) -> tuple[list[Point], list[Critical], str]:
     """All points from the first ones on, critical points between them, and why the walk ended (as in `Branch`)."""
     tolerance, size, length = path.solver.tolerance(points[0].x.dtype), float(extent(path.start)), step
@@ -254,8 +259,7 @@ def _walk(
         points.append(new)
         if int(new.corrections) <= EASY:
             length = min(1.5 * length, step)
-        if progress is not None:
-            progress(len(points), float(new.s))
+        report(len(points), f"s = {float(new.s):.4f}", call=(len(points), float(new.s)))
         if not interval[0] <= float(new.s) <= interval[1]:
             return points, critical, "left"
     return points, critical, "points"

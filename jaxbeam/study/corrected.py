@@ -34,6 +34,7 @@ from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import compiled, compute_if, usual_rules, zeros_like_result
+from jaxbeam.core.progress import Progress, Report, check_progress
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, unlock
 from jaxbeam.linear.layout import Layout, LinearSolver, assemble, expand, gather
 from jaxbeam.mesh.elements import element_of
@@ -80,7 +81,13 @@ class Corrected(NamedTuple):
 
 
 @usual_rules
-def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newton = Newton()) -> Corrected:
+def corrected(
+    meshes: TwoMeshes,
+    ratios: Numbers,
+    measure: Measure,
+    solver: Newton = Newton(),
+    progress: bool | Callable[[int, int], None] | None = None,
+) -> Corrected:
     """A measure of the equilibrium under commands, with an error bar, by a solve on two meshes.
 
     It costs a solve on the coarse mesh and two or three Newton steps on the finer one. `value`, `coarse`, `fine` and
@@ -93,6 +100,9 @@ def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newt
         ratios: `(m,)` commands, or `(B, m)`, a row for each of `B` answers.
         measure: `(scene, x)` to `()` or `(p,)`, such as `jb.tip_angle`. It is called on both meshes.
         solver: settings of the solves. Its `rtol` is used only where it is larger than those of this method.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            chunk, as `progress(done, all)`. It counts each of many commands three times: its solves on both meshes and
+            its bar. With a single command and inside jit there is no progress.
 
     Raises:
         ValueError: if the commands have another shape or are out of range, or as `equilibrium` does.
@@ -100,6 +110,7 @@ def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newt
     checks.instance("meshes", meshes, TwoMeshes, "make it with two_meshes(scene)")
     check_scene_and_solver(meshes.coarse, solver)
     checks.function("measure", measure, "(scene, x) -> scalar or (p,)")
+    check_progress(progress, "(done, all)")
     check_held(meshes.coarse)
     values = checks.shaped("ratios", ratios, None)
     if values.ndim not in (1, 2) or not all(values.shape[:-1]):
@@ -111,7 +122,7 @@ def corrected(meshes: TwoMeshes, ratios: Numbers, measure: Measure, solver: Newt
     layouts = layout_of(meshes.coarse), layout_of(meshes.fine)
     if is_concrete(rows, *jax.tree.leaves(meshes)):
         if rows.ndim == 2:
-            return _in_blocks(meshes, layouts, rows, measure, solver)
+            return _in_blocks(meshes, layouts, rows, measure, solver, progress)
         states = solve_both(unlock(meshes), layouts, rows, solver)
         return _values(meshes, layouts, rows, states, measure, solver.linear)
 
@@ -263,19 +274,35 @@ def _block(
 
 
 def _in_blocks(
-    meshes: TwoMeshes, layouts: tuple[Layout, Layout], rows: np.ndarray, measure: Measure, solver: Newton
+    meshes: TwoMeshes,
+    layouts: tuple[Layout, Layout],
+    rows: np.ndarray,
+    measure: Measure,
+    solver: Newton,
+    progress: Progress,
 ) -> Corrected:
     """The results for commands `rows` `(B, m)`: a sweep on each mesh, then the bars in blocks of neighbours."""
-    solutions = [jax.device_get(sweep(scene, rows, solver)) for scene in (meshes.coarse, meshes.fine)]
-    parts = partition(rows, np.arange(len(rows)), BLOCK)
+    count, stages = len(rows), ("coarse mesh", "finer mesh", "error bars")
+    parts = partition(rows, np.arange(count), BLOCK)
+
+    def tell(stage: int, done: int, total: int) -> None:
+        # A sweep counts the commands of this process, the blocks are those of all.
+        done = stage * count + count * done // total
+        report(done, stages[stage], call=(done, len(stages) * count))
 
     def solve(part: np.ndarray) -> Corrected:
         padded = np.resize(part, BLOCK)
         known = jax.tree.map(lambda leaf: leaf[padded], solutions)
         return jax.device_get(_block(meshes, layouts, rows[padded], *known, measure, solver.linear))
 
-    # The first block compiles the program; otherwise each thread would compile it.
-    results = [solve(parts[0])]
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        results += pool.map(solve, parts[1:])
+    with Report(progress, "solves and bars", len(stages) * count) as report:
+        both = enumerate((meshes.coarse, meshes.fine))
+        solutions = [jax.device_get(sweep(scene, rows, solver, partial(tell, stage))) for stage, scene in both]
+        # The first block compiles the program; otherwise each thread would compile it.
+        results = [solve(parts[0])]
+        tell(2, len(parts[0]), count)
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            for found in pool.map(solve, parts[1:]):
+                results.append(found)
+                tell(2, sum(map(len, parts[: len(results)])), count)
     return assembled(parts, results)

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
+from jaxbeam.core.progress import Report, check_progress
 from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene
 from jaxbeam.solve.equilibrium import equilibrium
@@ -41,7 +42,7 @@ def minimise(
     tolerance: float = 1e-8,
     goal: float | None = None,
     solver: Newton = Newton(),
-    progress: Callable[[int, float], None] | None = None,
+    progress: bool | Callable[[int, float], None] | None = None,
 ) -> Design:
     """Minimise a loss of the equilibrium over parameters, with any optimiser of optax.
 
@@ -59,7 +60,8 @@ def minimise(
         tolerance: stop when the largest component of the gradient is at most this fraction of that of the first one.
         goal: stop at a loss of at most this. Without a goal every stationary point counts as a success.
         solver: settings of each solve.
-        progress: called after each trial with the number of steps and the loss.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            trial, as `progress(steps, loss)`, with the number of steps and the loss.
 
     Returns:
         A `Design`. Its status is `REACHED` at the goal, or without a goal at a stationary point; `UNREACHABLE` at a
@@ -69,6 +71,7 @@ def minimise(
         ValueError: if `steps` is not a whole number of at least 0, `theta0` holds no floats, or as `design` does.
     """
     tolerance, goal = _check_arguments(loss, design, optimiser, steps, tolerance, goal)
+    check_progress(progress, "(steps, loss)")
     theta = _strong(theta0)
     leaves = jax.tree.leaves(theta)
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
@@ -78,7 +81,8 @@ def minimise(
     check_held(first)
     programs = _programs(loss, design, optimiser, solver)
     state = DescentState(theta, first.mesh.nodes, _strong(programs.init(theta)), last=theta)
-    _descend(state, programs, steps, tolerance, goal, progress)
+    with Report(progress, f"steps of at most {steps}") as report:
+        _descend(state, programs, steps, tolerance, goal, report)
     return _report(state)
 
 
@@ -178,7 +182,7 @@ def _descend(
     steps: int,
     tolerance: float,
     goal: float | None,
-    progress: Callable[[int, float], None] | None,
+    report: Report,
 ) -> None:
     """Take steps until the loss is at the goal or stationary, no steps are left, or too many trials fail in a row."""
     from optax import tree_utils
@@ -187,8 +191,7 @@ def _descend(
         (value, solution), grad = programs.evaluate(state.theta, state.x)
         slope = max(float(np.max(np.abs(leaf))) for leaf in jax.tree.leaves(grad))
         good = _record(state, solution, float(value), slope)
-        if progress:
-            progress(count, float(value))
+        report(count, f"loss {float(value):.4g}", call=(count, float(value)))
         if not good:
             state.skips += 1
             if count == 0 or state.skips > MAX_SKIPS:

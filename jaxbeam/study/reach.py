@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
@@ -14,6 +13,7 @@ from jax import lax
 
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import is_outermost, usual_rules
+from jaxbeam.core.progress import Progress, Report, check_progress
 from jaxbeam.core.tree import Numbers, is_concrete, namespace, replace, to_device
 from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.rigid import check_held
@@ -42,7 +42,7 @@ def reach(
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
-    progress: Callable[[int, float], None] | None = None,
+    progress: bool | Callable[[int, float], None] | None = None,
 ) -> Design:
     """Commands within `bounds` at which `measure` of the equilibrium is `target`.
 
@@ -65,7 +65,8 @@ def reach(
             in float32 1e-3.
         max_solves: largest number of equilibria to solve from each start.
         solver: settings of each solve.
-        progress: called after each solve with the number of solves so far and the distance from the target.
+        progress: `True` draws a line of progress on stderr, if that is a terminal. A function is called after each
+            solve, as `progress(solves, distance)`, with the number of solves so far and the distance from the target.
 
     Returns:
         A `Design`. If its status is `REACHED`, the target is met. If it is `UNREACHABLE`, `value` is the nearest value
@@ -83,14 +84,15 @@ def reach(
         ValueError: if bounds are not `low <= high` in the range of the commands, an argument has another shape, as
             `equilibrium` does, or if it is called inside `jit` or `vmap`: the search is a loop on the host.
     """
+    check_progress(progress, "(solves, distance)")
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
     goal = _known_or_traced("target", target)
     if goal.shape != shape:
         raise ValueError(f"target: expected the shape {shape} of the measure, got {goal.shape}")
     goal = jnp.asarray(goal, scene.mesh.nodes.dtype)
-    task, goals, begin = _on_host(problem, goal[None], begin, measure, int(max_solves), solver, progress)
-    found = _each_in_turn(task, goals, begin)[0]
+    task, goals, begin = _on_host(problem, goal[None], begin, measure, int(max_solves), solver)
+    found = _each_in_turn(task, goals, begin, progress)[0]
     if is_concrete(*jax.tree.leaves((problem, goal))):
         return found
     return _moving(problem, goal, found, measure, solver)
@@ -107,14 +109,15 @@ def reach_each(
     tolerance: float | None = None,
     max_solves: int = 40,
     solver: Newton = Newton(),
-    progress: Callable[[int, float], None] | None = None,
+    progress: bool | Callable[[int, float], None] | None = None,
 ) -> Design:
     """Commands for each of a sequence of targets `(T,)` or `(T, p)`, such as points of a path that the tip draws.
 
     The search for each target starts from the answer before, so neighbouring targets take few solves each. The first is
     found as by `reach`. Arguments, errors, answer and derivatives are those of `reach`, with leading axis `T`.
-    `progress` counts the solves of all targets.
+    A function `progress` counts the solves of all targets.
     """
+    check_progress(progress, "(solves, distance)")
     problem, begin = _problem(scene, bounds, starts, tolerance, max_solves, solver)
     shape = _shape(measure, scene)
     goals = _known_or_traced("targets", targets)
@@ -122,8 +125,8 @@ def reach_each(
         rows = f"(T, {shape[0]})" if shape else "(T,)"
         raise ValueError(f"targets: expected shape {rows}, a row for each target, got {goals.shape}")
     goals = jnp.asarray(goals, scene.mesh.nodes.dtype)
-    task, targets, begin = _on_host(problem, goals, begin, measure, int(max_solves), solver, progress)
-    each = _each_in_turn(task, targets, begin)
+    task, targets, begin = _on_host(problem, goals, begin, measure, int(max_solves), solver)
+    each = _each_in_turn(task, targets, begin, progress)
     found = jax.tree.map(lambda *rows: to_device(np.stack(rows)), *each)
     if is_concrete(*jax.tree.leaves((problem, goals))):
         return found
@@ -259,9 +262,10 @@ def _on_host(
     measure: Measure,
     max_solves: int,
     solver: Newton,
-    progress: Callable[[int, float], None] | None,
 ) -> tuple[Task, np.ndarray, Any]:
-    """The task (its target still empty), the targets `(T, ...)` and the starts, with values on the host.
+    """The task, the targets `(T, ...)` and the starts, with values on the host.
+
+    The target of the task is still empty, and it reports nothing.
 
     Raises:
         ValueError: if a value is traced by anything but derivatives.
@@ -277,7 +281,6 @@ def _on_host(
     known, goals, starts = values
     unit = np.asarray(command_units(known.scene, known.low, known.high), float)
     low, high = np.asarray(known.low, float) / unit, np.asarray(known.high, float) / unit
-    count = itertools.count(1)
     task = Task(
         scene=known.scene,
         layout=known.layout,
@@ -290,7 +293,7 @@ def _on_host(
         measure=measure,
         max_solves=max_solves,
         solver=solver,
-        report=lambda distance: progress(next(count), distance) if progress else None,
+        report=lambda distance: None,
     )
     if isinstance(starts, Known):
         starts = Known(np.asarray(starts.commands), starts.x)
@@ -299,15 +302,32 @@ def _on_host(
     return task, np.asarray(goals, float), starts
 
 
-def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray | Known) -> list[Design]:
+def _each_in_turn(
+    task: Task, targets: np.ndarray, begin: np.ndarray | Known, progress: Progress
+) -> list[Design]:
     """The design of each of the targets `(T, ...)`. Each search but the first starts from the answer before."""
     before: Trial | None = None
-    designs = []
-    for target in targets:
-        one = task._replace(target=np.ravel(target))
-        state = _search_all(one, begin) if before is None else search(one, before)
-        before = before if state.here is None else state.here
-        designs.append(_design(one, state, target.shape))
+    designs: list[Design] = []
+    several, solves = len(targets) > 1, 0
+    unit, total = ("targets", len(targets)) if several else ("solves", None)
+
+    def tell(distance: float) -> None:
+        nonlocal solves
+        solves += 1
+        figure, call = f"distance {distance:.2e}", (solves, distance)
+        if several:
+            report(len(designs), f"{solves} solves, {figure}", call)
+        else:
+            report(solves, figure, call)
+
+    with Report(progress, unit, total) as report:
+        for target in targets:
+            one = task._replace(target=np.ravel(target), report=tell)
+            state = _search_all(one, begin) if before is None else search(one, before)
+            before = before if state.here is None else state.here
+            designs.append(_design(one, state, target.shape))
+            if several:
+                report(len(designs), f"{solves} solves")
     return designs
 
 

@@ -65,6 +65,27 @@ def test_chunks_change_nothing_but_the_work(finer, chunks_of_five):
     np.testing.assert_array_equal(shuffled.x, whole.x[order])  # to the last bit: chunks do not depend on the order
 
 
+def test_line_of_progress(finer, chunks_of_five, terminal):
+    jb.sweep(finer, LINE, progress=True)
+    line, cursor = terminal.lines()
+    assert "] 25 of 25 commands, 0:" in line and cursor == ""
+
+
+def test_line_of_progress_ends_where_a_chunk_fails(finer, chunks_of_five, terminal, monkeypatch):
+    solve = module._on_devices
+
+    def fail_at_the_third(scene, layout, chunks, counts, *rest):
+        if (chunks[0, :5] == LINE[10:15]).all():
+            raise RuntimeError("out of memory")
+        return solve(scene, layout, chunks, counts, *rest)
+
+    monkeypatch.setattr(module, "_on_devices", fail_at_the_third)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        jb.sweep(finer, LINE, progress=True)
+    line, cursor = terminal.lines()
+    assert "] 10 of 25 commands, 0:" in line and cursor == ""
+
+
 def test_cores_change_nothing(finer, chunks_of_five, monkeypatch):
     """Also where Hessians are projected in several threads at once."""
     side = np.linspace(0.25, 0.6, 6)

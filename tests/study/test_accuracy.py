@@ -210,11 +210,15 @@ def test_algebraic_part_is_what_newton_left(coarse):
     assert abs(left) > 1e-6 and found.algebraic == pytest.approx(left, rel=0.2)
 
 
-def test_solve_to_climbs_as_far_as_it_must(coarse):
+def test_solve_to_climbs_as_far_as_it_must(coarse, terminal):
     scene, _ = coarse
-    easy = jb.solve_to(scene, jb.tip_angle, 1.0)
+    easy = jb.solve_to(scene, jb.tip_angle, 1.0, progress=True)
+    line, cursor = terminal.lines()
+    assert line.startswith(f"1 meshes, error bar {easy.estimate.bar:.2e}, 0:") and cursor == ""
     assert easy.met and easy.rung == 0 and easy.scene is scene
-    hard = jb.solve_to(scene, jb.tip_angle, 0.1)
+    calls = []
+    hard = jb.solve_to(scene, jb.tip_angle, 0.1, progress=lambda *call: calls.append(call))
+    assert calls == [(1, easy.estimate.bar), (2, hard.estimate.bar)]
     assert hard.met and hard.rung == 1 and hard.estimate.bar <= 0.1
     assert abs(hard.value - 10.142) <= hard.estimate.bar
     assert int(hard.solution.steps) < int(coarse[1].steps)

@@ -175,6 +175,13 @@ def test_start_and_direction(mirrored, straight):
     np.testing.assert_allclose(back.ratios, 1 + back.parameter[:, None] * (END - 1), rtol=1e-14)
 
 
+def test_line_of_progress(mirrored, straight, terminal):
+    branch = jb.trace_branch(mirrored, END, max_points=3, progress=True)
+    np.testing.assert_array_equal(branch.parameter, straight.parameter[:3])
+    line, cursor = terminal.lines()
+    assert line.startswith(f"3 points, s = {branch.parameter[-1]:.4f}, 0:") and cursor == ""
+
+
 # ------------------------------------------------------------------------------- one-sided: folds
 
 

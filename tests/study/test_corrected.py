@@ -55,17 +55,22 @@ def test_forward_and_reverse_derivatives_agree():
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
-def test_many_commands_are_each_like_one():
+def test_many_commands_are_each_like_one(terminal):
     meshes = jb.two_meshes(CROSSED())
     # A line of neighbours, and some far from each other.
     line = np.linspace([0.8, 1.0], [0.7, 0.95], 14)
     rows = np.concatenate([line, np.random.default_rng(2).uniform(0.5, 1.1, (6, 2))])
-    many = jb.corrected(meshes, rows, angle_and_tension)
+    calls = []
+    many = jb.corrected(meshes, rows, angle_and_tension, progress=lambda *call: calls.append(call))
+    assert calls == [(20, 60), (40, 60), (60, 60)] and terminal.getvalue() == ""
     jb.check(many.solution)
     for k in (0, 7, 19):
         one = jb.corrected(meshes, rows[k], angle_and_tension)
         np.testing.assert_allclose(many.value[k], one.value, rtol=1e-4)
         np.testing.assert_allclose(many.bar[k], one.bar, rtol=0.1)
+    jb.corrected(meshes, rows, angle_and_tension, progress=True)
+    line, cursor = terminal.lines()
+    assert "] 60 of 60 solves and bars, error bars, 0:" in line and cursor == ""
 
 
 @pytest.mark.slow

@@ -271,6 +271,14 @@ def test_progress(small):
     np.testing.assert_array_equal(calls[-1][1], each.loss[-1])
 
 
+def test_line_of_progress(small, terminal):
+    found = jb.reach(small, 8.0, progress=True)
+    each = jb.reach_each(small, [8.0, 9.0], progress=True)
+    first, second, cursor = terminal.lines()
+    assert first.startswith(f"{int(found.solves)} solves, distance {float(found.loss):.2e}, 0:")
+    assert f"] 2 of 2 targets, {int(each.solves.sum())} solves, 0:" in second and cursor == ""
+
+
 @pytest.mark.parametrize(
     "call",
     [
@@ -454,11 +462,13 @@ def test_stationary_point_over_the_goal(beam):
     assert int(free.status) == REACHED
 
 
-def test_step_without_equilibrium_is_taken_back():
+def test_step_without_equilibrium_is_taken_back(terminal):
     """Poisson's ratio runs over 0.5: the step is skipped, reported and halved, and the search goes on."""
     scene = lambda theta: jb.command(small_beam(poisson=theta["poisson"]), jnp.array([0.8, 1.0]))
     stiff = lambda scene, x: -jb.tip_position(scene, x)[0]
-    found = jb.minimise(stiff, {"poisson": 0.3}, optax.sgd(40.0), 12, design=scene, tolerance=1e-12)
+    found = jb.minimise(stiff, {"poisson": 0.3}, optax.sgd(40.0), 12, design=scene, tolerance=1e-12, progress=True)
+    line, cursor = terminal.lines()
+    assert line.startswith(f"12 steps of at most 12, loss {float(found.history.loss[-1]):.4g}, 0:") and cursor == ""
     status = np.asarray(found.history.status)
     assert (status[1:] & jb.Status.INVALID).any() and (status == 0).sum() > 1
     assert int(found.solution.status) == jb.Status.OK
@@ -471,7 +481,11 @@ def test_step_without_equilibrium_is_taken_back():
 def test_no_equilibrium_at_the_start():
     stuck = jb.Newton(max_steps=0)
     scene = lambda theta: jb.command(small_beam(), jnp.stack([theta, 1.0]))
-    found = jb.minimise(jb.tip_angle, 0.7, optax.sgd(1.0), 5, design=scene, solver=stuck)
+    calls = []
+    found = jb.minimise(
+        jb.tip_angle, 0.7, optax.sgd(1.0), 5, design=scene, solver=stuck, progress=lambda *call: calls.append(call)
+    )
+    assert calls == [(0, float(found.history.loss[0]))]
     assert int(found.status) == NOT_CONVERGED
     assert int(found.solves) == 1
     assert np.isinf(found.loss)
