@@ -1,7 +1,8 @@
-"""Steer the reference beam by its two tendons: pull the top one, the bottom one, and both; then the gallery.
+"""How does a beam bend when its tendons are pulled?
 
-Each pattern is approached in 28 steps. The gallery shortens one tendon by d and lengthens the other by d. Prints
-every answer beside the reference number for this mesh, and draws stills and animations.
+`ramp` pulls the top tendon of the reference beam, the bottom one, and both, each in 28 steps. `sweep` solves a gallery,
+in which one tendon is shortened by d and the other lengthened by d. Each answer is printed beside the reference number
+for this mesh, and drawn in stills and animations.
 """
 
 import argparse

@@ -1,4 +1,7 @@
-"""Tip angle, tensions and tendon lengths against actuation for three ways to pull, and fields of stress and J.
+"""How do tip angle and tensions grow as the tendons are pulled, and where is the stress?
+
+`ramp` solves the way for three ways to pull. Curves show tip angle, tensions and tendon lengths against actuation, and
+pictures of two end states show Cauchy stress, J and strain energy.
 
 Tensions are true forces, the derivative of a tendon's energy in its length. With both tendons pulled the branch from
 rest folds back near ratio 0.41 and the beam jumps: the last step of that curve is the jump.

@@ -1,4 +1,7 @@
-"""Add physics of your own: soft ground under the beam, and a wire whose tension is commanded.
+"""How do I add physics of my own?
+
+As an energy, which is a function of positions. Here there are two: soft ground under the beam, and a wire whose tension
+is commanded.
 
 The ground is a bare function. It pushes back on every node that sinks below its level, and does nothing otherwise.
 Forces, Hessians and the solver follow from the energy. Compares the beam steered down with and without ground.

@@ -1,10 +1,12 @@
-"""Where a beam snaps: both tendons pulled together from ratio 1.0 to 0.3, on two meshes.
+"""Where does a beam snap, and where to?
 
-The branch of equilibria from rest is followed through its folds. On a mesh that is symmetric about mid-height
-("mirrored") the beam stays straight until it loses stability at ratio 0.38258; from there a pair of bent states
-branches off, one on each side. It first turns back, by less than 1e-4 in the ratio, and is stable only behind its
-fold. One-sided diagonals spoil the symmetry: the branch folds back already at 0.40874, is unstable up to 0.41207, and
-goes on, stable, to a last fold at 0.37390.
+`trace_branch` follows the equilibria from rest through their folds, as both tendons are pulled together from ratio 1.0
+to 0.3, on two meshes. `lowest_mode` shows which shape becomes unstable.
+
+On a mesh that is symmetric about mid-height ("mirrored") the beam stays straight until it loses stability at ratio
+0.38258; from there a pair of bent states branches off, one on each side. It first turns back, by less than 1e-4 in the
+ratio, and is stable only behind its fold. One-sided diagonals spoil the symmetry: the branch folds back already at
+0.40874, is unstable up to 0.41207, and goes on, stable, to a last fold at 0.37390.
 
 The instability begins at the anchors, where the body is squeezed to half its area: `modes.png` colours the modes by
 how much they strain each element. The critical mode strains the elements beside the anchors, and the free half of the

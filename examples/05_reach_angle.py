@@ -1,9 +1,10 @@
-"""Reach a tip angle: the commands for a fan of targets from -34 to 34 degrees, and for one that is out of reach.
+"""How do I find the commands that bend the tip to an angle?
 
-`reach` finds, of all commands within the bounds, those of least effort `sum (1 - ratio)^2` at which the tip angle is
-the target. Exact first and second derivatives of the equilibrium take it from rest to within 1e-8 degrees in a handful
-of solves. One tendon pulls and the other stays at its natural length: to pull both for the same angle would cost more
-effort. A target of 50 degrees cannot be met, and `reach` says so: with the nearest angle, and the bounds in the way.
+By `reach`, here for a fan of targets from -34 to 34 degrees and for one that is out of reach. It finds, of all commands
+within the bounds, those of least effort `sum (1 - ratio)^2` at which the tip angle is the target. Exact first and
+second derivatives of the equilibrium take it from rest to within 1e-8 degrees in a handful of solves. One tendon pulls
+and the other stays at its natural length: to pull both for the same angle would cost more effort. A target of 50
+degrees cannot be met, and `reach` says so: with the nearest angle, and the bounds in the way.
 
 `minimise` can do the same by any optimiser of optax, on the squared deviation. It is made for designs of other kinds
 (07_design_shape.py); here it shows what the second derivatives are worth.

@@ -1,4 +1,6 @@
-"""Draw with the tip: a figure of eight, by the commands of two tendons that only ever pull.
+"""How do I make the tip follow a path?
+
+By `reach_each`, here along a figure of eight, with two tendons that only ever pull.
 
 With two tendons the tip can be brought anywhere in a crescent, mapped here by a sweep over the commands. `reach_each`
 walks along a closed curve in it. Each point starts from the answer before, and takes a few solves with the exact first

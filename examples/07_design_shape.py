@@ -1,4 +1,7 @@
-"""Design a body and its command together: a tapered beam that one tendon curls along a drawn spiral.
+"""How do I design the shape of a body?
+
+By `minimise`, over the parameters of the shape and here also the command: a tapered beam that one tendon curls along a
+drawn spiral.
 
 The curve is a clothoid: its curvature grows evenly along its length. A beam of uniform thickness under a tendon along
 its upper edge bends nearly into an arc of a circle, whatever the command. Where it should bend more it must be

@@ -1,4 +1,6 @@
-"""See that the derivatives are right: Taylor remainders and central differences of the steered reference beam.
+"""Are the derivatives right?
+
+Taylor remainders and central differences of the steered reference beam tell.
 
 The tip angle is a function of 746 parameters: both commands, both tendon moduli, a Young's modulus for each triangle
 and the rest position of each node. Along a random direction its gradient must predict a small change up to an error

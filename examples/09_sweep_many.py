@@ -1,8 +1,9 @@
-"""Where can the tip go? The equilibria of a grid of commands, on one process or on several, on one machine or on many.
+"""Where can the tip go?
 
-`sweep` continues each command from its nearest solved neighbour, so that one or two Newton steps are left to take, and
-uses all cores. Run as it is, this script solves a 64 x 64 grid and draws two pictures: the tip angle over the commands,
-and the reachable set of the tip.
+`sweep` solves a grid of commands, on one process or on several, on one machine or on many. It continues each command
+from its nearest solved neighbour, so that one or two Newton steps are left to take, and uses all cores. Run as it is,
+this script solves a 64 x 64 grid and draws two pictures: the tip angle over the commands, and the reachable set of the
+tip.
 
 On several processes it is the same script, started once for each, with their number, its own and the address of the
 first (here two on one machine):

@@ -1,4 +1,6 @@
-"""How fast, and how right? One command, solved by hand, as a rod, on one mesh and on two.
+"""How fast is an answer, and how right?
+
+One command is solved by hand, as a rod, on one mesh and on two, and each answer is timed and compared.
 
 The top tendon is pulled to 0.8 of its length, its free end spread over the surface within 0.25, so that there is an
 answer to converge to. Every way to solve is timed, after compiling, and set against a fine mesh: the error is that of

@@ -1,9 +1,11 @@
-"""A finger of three soft joints, curled to a wanted posture by three cables that only pull.
+"""How do I curl a jointed finger to a posture?
+
+By `reach`: it finds the commands of least effort at which the three segments point where they should. Three cables,
+which only pull, bend three soft joints.
 
 The finger is a rectangle of stiff segments. At each joint it is soft, and notched from below, so that it bends there.
 Three cables run along the lower side: the first ends behind the first joint, the second behind the second, the third at
-the tip. `reach` finds the commands of least effort at which the three segments point where they should. One cable alone
-cannot do it: it bends all the joints that it passes.
+the tip. One cable alone cannot do it: it bends all the joints that it passes.
 
 The posture is within what cables can do, because each joint bends no more than the one before. Asked for a tip that
 curls on its own, `reach` says `UNREACHABLE`, and how near it came.

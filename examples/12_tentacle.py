@@ -1,9 +1,12 @@
-"""A tapered tentacle with six cables that only pull draws a figure of eight with its tip.
+"""How do I steer a tentacle that has more cables than it needs?
+
+By `reach_each`: of all commands that bring the tip to a point it finds those of least effort. The tentacle is tapered,
+has six cables that only pull, and draws a figure of eight with its tip.
 
 Three cables run along each side, through a guide at every sixth of the length. They end at a third, at two thirds and
-at the end. `reach_each` walks along the figure, and finds the commands of least effort for each point. Where the figure
-crosses the axis, the tip is drawn back by a sixth of the length. So cables of both sides pull at once, and bend the
-tentacle to the shape of an S. Three of the six are shortened; the others stay at their natural lengths.
+at the end. Where the figure crosses the axis, the tip is drawn back by a sixth of the length. So cables of both sides
+pull at once, and bend the tentacle to the shape of an S. Three of the six are shortened; the others stay at their
+natural lengths.
 
 The search is local: each point starts from the answer before. The tentacle and the figure are symmetric, but the
 commands at the top and at the bottom are not. Those of the bottom take more effort than the mirror image of the top's.

@@ -1,8 +1,10 @@
-"""Two fingers close on a disk with a wanted force.
+"""How far must a gripper close to hold with a given force?
 
-One motor shortens the cables along the inner sides of both fingers: one command, `shared=True`. `reach` finds the
-shortening at which each finger presses on the disk with the force asked for, starting from open fingers, where the
-force has no slope. A ramp shows it growing from the first touch.
+By `reach`, with the contact force as its measure: it finds the shortening at which two fingers press on a disk with the
+force asked for. It starts from open fingers, where the force has no slope.
+
+One motor shortens the cables along the inner sides of both fingers: one command, `shared=True`. A ramp shows the force
+growing from the first touch.
 
 The disk is rigid and held where it is. It is lifted in the picture, not in the model: there is no friction.
 """

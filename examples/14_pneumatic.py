@@ -1,8 +1,10 @@
-"""A beam bent by pressure in eight chambers, and by a cable to the same angle. The mesh comes from Gmsh.
+"""How do I bend a body with chambers by pressure, on a mesh of my own?
 
-The chambers lie in the upper half. Blown up, they stretch it, and the beam bends down. `reach` finds the pressure at
-which the tip section has turned by 40 degrees, and the shortening of a cable along the lower side that turns it as far.
-The two shapes differ: the chambers make the beam longer, the cable makes it shorter.
+`files.read_mesh` reads the mesh, here from Gmsh. `reach` finds the pressure in eight chambers at which the tip section
+has turned by 40 degrees, and the shortening of a cable along the lower side that turns it as far.
+
+The chambers lie in the upper half. Blown up, they stretch it, and the beam bends down. The two shapes differ: the
+chambers make the beam longer, the cable makes it shorter.
 
 `14_pneumatic.msh` holds six-node triangles and named groups: the clamp, the tip, the lower side and the chambers. Other
 meshes of such groups, in any format that meshio reads, may take its place.

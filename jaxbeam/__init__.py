@@ -1,9 +1,152 @@
-"""jaxbeam: a differentiable simulator of soft beams steered by contractile tendons.
+"""A differentiable simulator of soft beams steered by contractile tendons.
 
-Each folder is a room. Read them in the order core, mesh, physics, scene, linear, solve, study: a room imports only from
-rooms before it. The names below are all that a user needs.
-Pictures are in `jaxbeam.plot`, which is imported by itself because it needs matplotlib. Files are read and written by
-`jaxbeam.files`, which is imported by itself too.
+    scene = jb.tendon_beam()                        # make a beam,
+    pulled = jb.command(scene, [0.4, 1.0])          # pull a tendon,
+    solution = jb.check(jb.equilibrium(pulled))     # solve, and refuse what is not right,
+    angle = jb.tip_angle(pulled, solution.x)        # read the answer
+
+All public names, by task. `help(jb.reach)` says all about one. The gallery `examples/README.md`
+shows what can be done.
+
+Make a beam
+  tendon_beam               the reference beam of triangles, with two tendons
+  rod_beam                  the same as a rod: cheaper, and less exact
+  Scene                     a scene of your own: a mesh, terms, what is fixed, the tip
+
+Bodies of other shapes
+  rectangle                 mesh of a rectangle, uniform or graded
+  mapped                    a mesh moved to another shape, such as a taper or a bend
+  without                   a mesh without some elements: holes and chambers
+  joined                    several bodies in one mesh, such as two fingers
+  Mesh                      a mesh of your own nodes and triangles
+  quadratic                 six nodes in each triangle in place of three
+  refined                   each triangle cut into four
+  nodes_where               nodes by a condition on x and y
+  nearest_node              the node nearest to a point
+  elements_where            elements by a condition on x and y
+  side                      nodes along the surface, from one node to another
+  along                     nodes of a line at given distances: guides
+  arc_lengths               distances along a line of nodes
+  surface_lines             the closed lines that bound a body and its holes
+
+Materials
+  solid                     the elastic body: a mesh, parameters and a density
+  lame                      parameters from Young's modulus and Poisson's ratio
+  lame_macklin_mueller      the same for `macklin_mueller`, right at small strain
+  macklin_mueller           neo-Hookean, finite for inverted elements; the default
+  neo_hookean               neo-Hookean, exact at small strain, for J > 0 only
+  saint_venant_kirchhoff    for large rotations at small strains
+  linear_elastic            for small rotations and small strains
+
+Tendons and other actuators
+  tendons                   springs along lines through guides; they pull and push
+  cables                    the same, but they only pull
+  pulls                     cables under a tension that is commanded
+  pressure                  pressure in a chamber or on a side, also commanded
+  support                   nodes that are moved by a command, such as by a grip
+  constant_stiffness        law of a tendon: stiffness as given
+  inverse_stiffness         law of a tendon: EA over its commanded length
+  inverse_square_stiffness  law of a tendon: that of the reference beam
+  command                   the scene under new commands
+
+Loads, contact and supports
+  dead_load                 forces on nodes
+  traction                  force on edges of the surface
+  weight                    force on all area, such as gravity
+  contact                   a rigid obstacle that the surface may touch
+  half_plane                an obstacle: a floor or a wall
+  disk                      an obstacle: a disk
+  box                       an obstacle: a rectangle
+  clamped                   nodes that do not move
+  penalty_springs           nodes held by springs: a soft clamp
+
+Physics of your own
+  Term                      an energy, its nodes and parameters; a function is enough
+  Energy                    an energy that is also commanded, ramped, drawn, refined
+  NotRefinable              raised by an energy without a form on a finer mesh
+
+Solve
+  equilibrium               one command
+  ramp                      the way to a command in steps, as if pulled slowly
+  commands                  the commands of such a ramp
+  sweep                     many commands, on all cores
+  linear_response           one linear solve, for small deflections
+  Newton                    settings of the solver
+  BlockTridiagonal          its linear solver
+  Dense                     its linear solver for tiny scenes
+
+Read the answer
+  tip_angle                 deflection of the tip, degrees
+  tip_position              mean position of the tip
+  section_rotation          turn of the tip section, degrees
+  marker                    position of any point of the body
+  curvature                 curvature along a line of nodes
+  tendon_lengths            present lengths of tendons
+  tendon_tensions           forces of tendons
+  tendon_slack              which cables are slack
+  guide_forces              forces of tendons on the body at ends and guides
+  contact_forces            forces of obstacles on edges
+  contact_pressures         largest pressure on each edge
+  penetration               how deep edges have sunk into obstacles
+  reactions                 forces of clamps and supports
+  forces                    forces of all terms on nodes
+  energy                    energy of all terms
+  strain_energy             elastic energy of each element
+  cauchy_stress             stress in the plane, of each element
+  nodal_stress              stress in the plane, at nodes: smoother
+  out_of_plane_stress       stress across the plane, of each element
+  von_mises_stress          von Mises stress of each element
+  principal_stretches       principal stretches of each element
+  jacobians                 J, the change of area, of each element
+  smallest_jacobian         smallest J anywhere in the body
+
+Is it right?
+  check                     raises for an answer that cannot be trusted, says why
+  Status                    flags of what is wrong with a solution
+  EquilibriumError          the error that `check` raises
+  lowest_mode               how stable: lowest eigenvalues and their shapes
+  trace_branch              where it snaps: a branch through its folds
+  estimate_error            error bar of a measure: what the mesh leaves
+  model_doubt               what speaks against the model of a rod
+
+Choose speed against accuracy
+  choose                    the cheapest way to solve the tendon beam to an error
+  euler_bernoulli           the tendon beam by hand
+  two_meshes                a scene on its mesh and a finer one, for `corrected`
+  corrected                 a measure with an error bar, for one or many commands
+  solve_to                  refine until a measure is within a tolerance
+  enriched                  a scene on a finer mesh
+
+Design
+  reach                     commands that bring a measure to a target
+  reach_each                the same for a sequence of targets, such as a path
+  minimise                  any loss of any design: shape, material, commands
+
+Pictures and files, imported by themselves
+  jaxbeam.plot              stills, curves, galleries and animations
+  jaxbeam.files             meshes in; results for ParaView and tables out; archives
+
+Types of what comes back
+  Solution                  of `equilibrium`, `ramp` and `sweep`
+  Design                    of `reach`, `reach_each` and `minimise`
+  DesignStatus              how a design ended
+  History                   the trials of a design
+  Modes                     of `lowest_mode`
+  Branch                    of `trace_branch`
+  Critical                  a fold or a bifurcation on a branch
+  ErrorEstimate             of `estimate_error`
+  Answer                    of `solve_to`
+  TwoMeshes                 of `two_meshes`
+  Corrected                 of `corrected`
+  Doubt                     flags of why `corrected` knows no error bar
+  Choice                    of `choose`
+  Lame                      of `lame`
+  Marker                    of `marker`
+  Obstacle                  of `half_plane`, `disk` and `box`, or your own
+
+`jaxbeam.plot` needs matplotlib, and `jaxbeam.files` needs meshio for meshes and for ParaView.
+Each folder is a room. Read them in the order core, mesh, physics, scene, linear, solve, study:
+a room imports only from rooms before it. `help(jb.solve)` and so on say when to use what is in it.
 """
 
 from types import ModuleType as _ModuleType

@@ -1,4 +1,8 @@
-"""Bodies made of other meshes: mapped to another shape, with holes, and several side by side."""
+"""Bodies made of other meshes: mapped to another shape, with holes, and several side by side.
+
+Choose nodes and elements on the plain rectangle, where conditions are simple, and then map it: `mapped` keeps their
+numbers. `without` and `joined` change numbers and return the new ones.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Triangles have three nodes (P1) or six (P2, in the order of `jaxbeam.mesh.triangle`) and are counter-clockwise. Lengths
 are in the user's unit. A mesh is checked once, here, on the host. The rest of the package trusts a `Mesh`.
+
+Make a `Mesh` of nodes and triangles of your own where neither `rectangle` nor `jaxbeam.files.read_mesh` will do.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Meshes of a rectangle, uniform or graded."""
+"""Meshes of a rectangle, uniform or graded.
+
+Uniform meshes with one-sided diagonals are those of the reference scene. `"crossed"` diagonals favour no direction and
+lock less; `"mirrored"` ones keep the symmetry about mid-height at half the triangles. For accuracy take `order=2` and
+`graded="proportional"`, if the beam is clamped at its left edge and steered from its middle.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Finer meshes that can represent every displacement field of a coarser one."""
+"""Finer meshes that can represent every displacement field of a coarser one.
+
+For accuracy take `quadratic` first and `refined` next. They change the mesh alone, before a scene is made of it.
+`jaxbeam.enriched` refines a scene with all its terms.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Lines of nodes along the surface of a body or other edges of its elements, and places on them by arc length."""
+"""Lines of nodes along the surface of a body or other edges of its elements, and places on them by arc length.
+
+They are for bodies whose sides are curved or slanted, where no condition on x and y picks the nodes: `side` gives the
+line, `along` the guides of a cable on it, `surface_lines` the wall of each chamber.
+"""
 
 from __future__ import annotations
 

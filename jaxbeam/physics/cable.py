@@ -1,5 +1,8 @@
 """Cables: tendons that only pull. A slack cable has no force and no energy.
 
+Use them for threads, and `tendons` for springs. At rest all cables are slack. Where `reach` finds no way from there,
+give it `starts` at which some are taut.
+
 With the length `l`, the commanded length `l*` and the stretch `s = l - l*` of a cable, the energy is
 
     k w^2 h(s / w)

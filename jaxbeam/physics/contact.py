@@ -1,5 +1,7 @@
 """Contact of the surface of a body with rigid obstacles, without friction.
 
+Use it where the body may touch an obstacle and leave it. Where nodes are held all the time, use `clamped` or `support`.
+
 An obstacle is a function of a point that is its distance from the obstacle, negative inside. Where the surface of the
 body is at the distance `g`, the obstacle pushes with the pressure
 

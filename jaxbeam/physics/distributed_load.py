@@ -1,5 +1,8 @@
 """Dead loads on area and on edges: weight and traction, forces that keep their size and direction.
 
+Use `weight` for gravity and `traction` for a force along a side. `dead_load` is for forces on single nodes, and
+`pressure` for a load that turns with the surface.
+
 The shape functions `N_a` of an element or an edge share the load out to its nodes:
 
     f_a = force int N_a

@@ -1,4 +1,9 @@
-"""Dead loads: forces on nodes that keep their size and direction."""
+"""Dead loads: forces on nodes that keep their size and direction.
+
+Use them on rods, where the third component is a moment, and to compare with other codes. On triangles a force on a node
+is a point load: displacements there grow without limit as the mesh is refined, and have no error bar. `traction` and
+`weight` are spread out.
+"""
 
 from __future__ import annotations
 

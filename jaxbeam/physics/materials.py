@@ -4,6 +4,10 @@ Each takes `Lame` parameters and `H = F - I` `(2, 2)`, with `F` the deformation 
 rest volume (units of Young's modulus; thickness is 1). The formulas are evaluated in `H`, so that small strains keep
 their digits: `J - 1` is `tr H + det H`, and `distortion_and_volume` evaluates `(|F|^2 - 2) / 2 - (J - 1)`. All are
 differentiable to any order in `H` and in the parameters.
+
+Use `neo_hookean` where measured constants are to hold at small strain. `macklin_mueller` is the default and that of the
+reference scene. It is finite for inverted elements, and with `lame_macklin_mueller` it has the constants that it is
+given. `saint_venant_kirchhoff` and `linear_elastic` are for small strains, to compare with other codes.
 """
 
 from __future__ import annotations

@@ -8,6 +8,9 @@ Computers & Structures 18 (1984), 1099-1114). The potential is `p` times the are
 
 with vectors `x` and `dx` and any point `c`. So the stiffness is symmetric, and the solver needs to know nothing of
 pressure. On a line with an end that moves there is no potential.
+
+So use it for chambers, and for sides whose ends are clamped. On a side with a free end use `traction`, which does not
+turn.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 With the tension `T` and the present length `l` the energy is `T l`. Its slope in `l` is the tension, whatever the
 length. Without tension there is no energy and no force.
+
+Use `pulls` where the force is known, and `cables` or `tendons` where the length that is wound in is known. Under a
+given force a body may snap where under a given length it would not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Solids: the energy density of a material, summed over the quadrature points of each element."""
+"""Solids: the energy density of a material, summed over the quadrature points of each element.
+
+A body of several materials is one `solid` with parameters for each element. `elements_where` finds those of a segment.
+"""
 
 from __future__ import annotations
 

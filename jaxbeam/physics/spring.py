@@ -1,4 +1,8 @@
-"""Springs from nodes to their rest positions."""
+"""Springs from nodes to their rest positions.
+
+They are for soft supports, and for comparison with codes that clamp by a penalty. To hold nodes use `clamped`, which is
+exact, and to move them `support`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Supports: coordinates of nodes that are moved by a command, such as those of a grip.
 
+Use a support where a displacement is given and its force is asked for. For what never moves use `clamped`.
+
 The displacement of a held coordinate is its motion times the command. Such a coordinate is no unknown: it is where its
 support puts it, and the force that this takes is its reaction (`jaxbeam.reactions`). So a support has no energy.
 """

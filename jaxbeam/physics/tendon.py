@@ -1,7 +1,10 @@
 """Tendons: springs along a line through points of a body, commanded by their rest length.
 
 A tendon's tension is positive if it pulls its ends together. These tendons are two-way: a tendon whose commanded length
-exceeds the length of its line pushes.
+exceeds the length of its line pushes. `cables` only pull.
+
+The law of stiffness is a choice. `inverse_square_stiffness` is that of the reference scene. `inverse_stiffness` is that
+of an elastic thread of which a part is wound in, and `constant_stiffness` that of a spring behind a stiff thread.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""The reference scenes: the tendon beam made of triangles, and as a rod."""
+"""The reference scenes: the tendon beam made of triangles, and as a rod.
+
+The defaults of `tendon_beam` are the reference scene, to compare with other codes: at ratio 0.8 its angle is 13 % too
+small. For accurate answers set `order=2`, `graded="proportional"` and an `anchor_width`, or let `choose` do so.
+`rod_beam` takes half of the time, and `model_doubt` says where its error is not known.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Energy, forces and Hessians of a scene, and the margin of its elements, summed or taken over its terms."""
+"""Energy, forces and Hessians of a scene, and the margin of its elements, summed or taken over its terms.
+
+`energy` and `forces` read any positions, in balance or not: to test a term of your own, or for a loss. What holds the
+body in equilibrium is in `reactions`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,12 @@
 """What is measured on a beam: angles, positions, lengths, tensions, stresses, energies.
 
 Each takes the scene and node positions `x` `(n, 2)`, of a rod `(n, 3)`, is pure, and is differentiable in both. An `x`
-of another shape is refused: for many states use `jax.vmap`.
+of another shape is refused: for many states use `jax.vmap`. Any function of your own of this form serves `reach`,
+`estimate_error` and `corrected` as well.
+
+`tip_angle` is how far the tip has moved aside, and stays below 90 degrees. Where a beam curls, use `section_rotation`.
+`cauchy_stress` jumps between elements. For the stress at a place use `nodal_stress`.
+
 Angles are in degrees, everything else in the user's units.
 """
 

@@ -1,7 +1,7 @@
 """Whether a body passes through itself.
 
-Contact is not modelled, so two parts of a body may overlap. Such a state can be an equilibrium of the model, but not of
-a real beam. In such a state two edges of the surface cross.
+Contact of a body with itself is not modelled, so two parts of it may overlap. Such a state can be an equilibrium of the
+model, but not of a real beam. In such a state two edges of the surface cross.
 
 The surface is treated as straight segments. The edge of a six-node triangle is a parabola and is cut into `SEGMENTS`
 segments. The surface of a rod is a pair of lines, at half its height on either side of each element.

@@ -1,4 +1,7 @@
-"""Points and lines that follow the body: markers anywhere in it, and the curvature of lines of nodes."""
+"""Points and lines that follow the body: markers anywhere in it, and the curvature of lines of nodes.
+
+Use a `marker` for a place that is no node. The position of a node is in `solution.x`.
+"""
 
 from __future__ import annotations
 

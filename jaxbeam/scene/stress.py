@@ -1,5 +1,8 @@
 """Stress out of the plane, von Mises stress, stretches and energy density of each element of the solids.
 
+Use `von_mises_stress` for yielding, and `principal_stretches` for how far a soft material is stretched. The stress in
+the plane is in `cauchy_stress` and `nodal_stress`.
+
 Each takes the scene and node positions `x` `(n, 2)`, is pure, differentiable in both, and runs under `jit` and `vmap`.
 Values are means over the quadrature points of an element, in the order of the terms, as those of `cauchy_stress`.
 """

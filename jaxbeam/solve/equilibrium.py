@@ -3,6 +3,8 @@
 At equilibrium the gradient of the energy vanishes at every free coordinate. The equilibrium is stable if the Hessian
 there is positive definite. `follow` (`jaxbeam.solve.continuation`) makes as many Newton solves as it takes to follow a
 path of scenes. A single equilibrium is a path with one target.
+
+For many commands use `sweep`, for the way to one `ramp`; both cost less than as many calls of `equilibrium`.
 """
 
 from __future__ import annotations

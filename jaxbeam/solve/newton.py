@@ -1,5 +1,8 @@
 """Newton's method for the unknown node positions of one scene, inside jit.
 
+`Newton` holds its settings, and the defaults are for all scenes. Change `escape` to keep a saddle, `max_steps` where a
+solve runs out of them, and `rtol` where a rougher answer will do.
+
 A step solves `K dx = -g`, with the gradient `g` of the energy and a positive definite stiffness `K`
 (`jaxbeam.solve.stiffness`), and is shortened by a line search (`jaxbeam.solve.line_search`). The iteration ends when
 the relative residual (`jaxbeam.solve.residual`) is small. At a solution the Cholesky factor of the true Hessian exists

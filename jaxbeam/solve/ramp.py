@@ -1,4 +1,8 @@
-"""Ramps: a command is approached from rest in even steps."""
+"""Ramps: a command is approached from rest in even steps.
+
+Use a ramp for what happens on the way, and where the state depends on the path. Steps that are too long are cut. More
+of them give smoother curves, and cost about one Newton step each.
+"""
 
 from __future__ import annotations
 

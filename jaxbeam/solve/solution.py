@@ -1,4 +1,8 @@
-"""The result of a solve, with flags and figures that tell how far to trust it."""
+"""The result of a solve, with flags and figures that tell how far to trust it.
+
+Outside jit, pass each solution through `check`, which raises unless the status is `OK`. Inside jit, look at `status`
+yourself: 0 is `OK`.
+"""
 
 from __future__ import annotations
 

@@ -7,6 +7,9 @@ takes ten or twenty.
 Commands are divided into chunks of neighbours, by a rule that depends on the commands and the scene alone. One compiled
 program solves a chunk of any number of commands, from rest outward. Chunks are independent: they run on all cores,
 devices and processes, in any order, with the same results.
+
+Use `ramp` where the order of commands matters, because a sweep follows no path, and `corrected` where each answer needs
+an error bar.
 """
 
 from __future__ import annotations

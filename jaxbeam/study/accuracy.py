@@ -1,5 +1,8 @@
 """The discretisation error of a measure, and refinement until the error is below a tolerance.
 
+`estimate_error` judges a solution that is there already. `solve_to` finds the mesh for a tolerance. For many commands,
+inside jit or for derivatives use `corrected`.
+
 The solution of a scene is carried over to a finer mesh that contains it. There triangles of six nodes replace those of
 three, and four triangles replace each one of six nodes. On the finer mesh the solution is not in balance. The
 unbalanced forces `g`, weighted by the adjoint `z` of the measure `M`,

@@ -3,6 +3,9 @@
 A branch leads from one scene to another that differs in its commands, its loads or any other numbers. It is followed
 step by step (`jaxbeam.study.arclength`). The number of negative eigenvalues of the tangent stiffness tells stability;
 where it changes is a critical point, and from a bifurcation the branch that crosses there can be followed.
+
+Use it to find where a beam snaps, and what states there are besides. A `ramp` tells where the beam ends up after the
+snap, and `lowest_mode` how near one state is to it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""The tendon beam by a hand calculation: linear beam theory, to compare models with."""
+"""The tendon beam by a hand calculation: linear beam theory, to compare models with.
+
+Its formulas show how the answer scales with each number. Where its `warning` is not empty, use `rod_beam` or
+`tendon_beam`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Which model and mesh of the tendon beam to use for an error: a table that was measured.
 
+Ask `choose` first if the body is a tendon beam; for other bodies there is no table, and `solve_to` finds the mesh.
+
 The errors are those of `python -m benchmarks.accuracy --conditions`: of tip angle and tension of the top tendon, the
 larger, over ratios from 0.95 to 0.5. Each condition differs from the reference beam in one thing. Times are those of
 one solve after compiling, over that of one jump of the reference scene, by `python -m benchmarks.accuracy`.

@@ -1,5 +1,8 @@
 """Measures with error bars, from equilibria on two meshes (`jaxbeam.study.two_meshes`).
 
+Use `corrected` where many answers need a bar, inside jit, or with derivatives; its value is better than that of either
+mesh. `estimate_error` judges a solution that is there already, and `solve_to` finds the mesh for a tolerance.
+
 Let `c` and `f` be the measure on the coarse and on the finer mesh. The change `f - c` consists of parts. With the
 adjoint `z` of the measure on the finer mesh, its interpolation `z_c` on the coarse mesh, and the gradient `g` of the
 energy at the coarse positions, carried over,

@@ -1,4 +1,8 @@
-"""The result of inverse design."""
+"""The result of inverse design, by `reach`, `reach_each` and `minimise`.
+
+Look at `status` first: only `REACHED` means that the target or the goal is met. `theta` is the answer, and `solution`
+its equilibrium, ready to be drawn.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Where the cheaper models of the tendon beam were measured, and what is to be doubted elsewhere.
 
+Ask `model_doubt` of a rod before you rely on it. Of triangles `estimate_error` tells the error.
+
 The hand calculation and the rod have the error of their assumptions, which no finer mesh shows. It was measured against
 six-node triangles (19 x 9 corners, proportional, anchors of width 0.25) of the material `macklin_mueller`, on beams of
 length over height 2, 3, 4, 4.375, 6 and 10, at Poisson's ratio 0.3, 0.45 and 0.49, with tendons of a fifth, once and

@@ -1,4 +1,8 @@
-"""Inverse design by commands: of all commands that bring a measure to a target, those of least effort."""
+"""Inverse design by commands: of all commands that bring a measure to a target, those of least effort.
+
+Use `reach` for one target and `reach_each` for a path. Where the unknowns are not commands, or there is a loss to lower
+and no value to meet, use `minimise`.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,9 @@
 An equilibrium is stable if every eigenvalue of the tangent stiffness, over the free coordinates, is positive.
 The stiffness is that of the nodes, so an eigenvalue (force / length) depends on the mesh; its sign does not,
 nor does the command at which it is zero.
+
+`status` says already whether a solution is stable. Use `lowest_mode` to see how near it is to a snap and in which shape
+it would go, and `trace_branch` to find the command at which it does.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """Equilibria on two meshes: most of the way on a coarse mesh, the last steps on a finer one that contains it.
 
+Make `two_meshes(scene)` once, and give it to `corrected` for each command or for many.
+
 The solution of the coarse mesh is carried over to the finer mesh. From there Newton's method takes one to three steps
 where a solve from rest takes ten. Then follow *short steps* with the last factor, which cost a fifth of a Newton step,
 until they are small beside the change from the coarse mesh to the finer one, which estimates the error of the mesh.
