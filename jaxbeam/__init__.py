@@ -22,7 +22,7 @@ Bodies of other shapes
   quadratic                 six nodes in each triangle in place of three
   refined                   each triangle cut into four
   nodes_where               nodes by a condition on x and y
-  nearest_node              the node nearest to a point
+  nearest_node              the node nearest to a point, or to each of many
   elements_where            elements by a condition on x and y
   side                      nodes along the surface, from one node to another
   along                     nodes of a line at given distances: guides
@@ -94,6 +94,9 @@ Read the answer
   strain_energy             elastic energy of each element
   cauchy_stress             stress in the plane, of each element
   nodal_stress              stress in the plane, at nodes: smoother
+  nodal_von_mises_stress    von Mises stress at nodes
+  to_nodes                  values of elements carried to the nodes
+  strain_energy_density     elastic energy by area, of each element
   out_of_plane_stress       stress across the plane, of each element
   von_mises_stress          von Mises stress of each element
   principal_stretches       principal stretches of each element
@@ -123,7 +126,7 @@ Design
   minimise                  any loss of any design: shape, material, commands
 
 Pictures and files, imported by themselves
-  jaxbeam.plot              stills, curves, galleries and animations
+  jaxbeam.plot              stills, curves, animations, and a window to play in
   jaxbeam.files             meshes in; results for ParaView and tables out; archives
 
 Types of what comes back

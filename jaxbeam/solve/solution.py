@@ -16,16 +16,18 @@ from jaxbeam.core.tree import holds_arrays, is_concrete, pytree
 
 
 class Status(enum.IntFlag):
-    """What is wrong with a solution, as flags that combine; see `REMEDIES` for what to do.
+    """What is wrong with a solution, as flags that combine. `check` tells them with what to try.
 
-    OK: nothing.
-    NOT_CONVERGED: no equilibrium was found.
-    NONFINITE: energy or forces are not finite.
-    INVERTED: an element has `J <= 0`, or an obstacle lies within the body.
-    UNSTABLE: the equilibrium is a saddle.
-    INVALID: a parameter of the scene is out of its range.
-    INACCURATE: round-off leaves positions or stability uncertain.
-    OVERLAPPING: the body passes through itself.
+    OK: nothing: it converged, and is stable and not inverted.
+    NOT_CONVERGED: no equilibrium was reached. `x` is the last state that was in balance, and `reached` says how far
+        along the way to the command it is.
+    NONFINITE: energy or forces are not finite at the start.
+    INVERTED: an element is turned inside out (`J <= 0`), or an obstacle lies within the body.
+    UNSTABLE: the equilibrium is a saddle. Only with `Newton(escape=False)`: else it is left for a stable one.
+    INVALID: a traced parameter is out of its range. One that is known raises a `ValueError` at once.
+    INACCURATE: round-off leaves positions uncertain by more than a thousandth of the body, or the stability: use
+        float64.
+    OVERLAPPING: the body passes through itself, which nothing models: the reference beam does from a ratio of 0.2 down.
     """
 
     OK = 0

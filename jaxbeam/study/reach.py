@@ -306,9 +306,7 @@ def _on_host(
     return task, np.asarray(goals, float), starts
 
 
-def _each_in_turn(
-    task: Task, targets: np.ndarray, begin: np.ndarray | Known, progress: Progress
-) -> list[Design]:
+def _each_in_turn(task: Task, targets: np.ndarray, begin: np.ndarray | Known, progress: Progress) -> list[Design]:
     """The design of each of the targets `(T, ...)`. Each search but the first starts from the answer before."""
     before: Trial | None = None
     designs: list[Design] = []
