@@ -157,12 +157,32 @@ def replace(tree: T, **changes: Any) -> T:
     return new
 
 
-def holds_arrays(tree: Any, one: Any) -> bool:
-    """Whether all leaves of `tree` are arrays, and `one`, a field that could also be `None`, is one too.
+def why_unknown(tree: Any, *others: Any) -> str:
+    """Why the numbers of a tree cannot be told, in words; empty if they can. For `repr`, which must always work.
 
-    JAX builds trees of the same structure with any values as leaves, and `repr` must work for these too.
+    JAX builds trees of the same structure with any values as leaves. `others` are fields that could also be `None`.
     """
-    return all(isinstance(leaf, jax.Array | np.ndarray) for leaf in [*jax.tree.leaves(tree), one])
+    leaves = [*jax.tree.leaves(tree), *others]
+    if not all(isinstance(leaf, jax.Array | np.ndarray) and _is_number(leaf.dtype) for leaf in leaves):
+        return "a tree of other values"
+    if not is_concrete(*leaves):
+        return "traced"
+    on_device = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+    if any(leaf.is_deleted() for leaf in on_device):
+        return "deleted"
+    return "" if all(leaf.is_fully_addressable for leaf in on_device) else "spread over processes"
+
+
+def _is_number(dtype: Any) -> bool:
+    """Whether it is a dtype of numbers or booleans; tangents of whole numbers have another one."""
+    return isinstance(dtype, np.dtype) and dtype.kind in "biufc"
+
+
+def numbers_in_words(values: Any, most: int = 8) -> str:
+    """Numbers `(m,)` to six digits, such as `[0.4, 1]`; of more than `most` the first ones and the count."""
+    row = np.ravel(values)
+    shown = ", ".join(f"{value:.6g}" for value in row[:most])
+    return f"[{shown}]" if row.size <= most else f"[{shown}, ... {row.size} in all]"
 
 
 def is_concrete(*values: Any) -> bool:

@@ -2,6 +2,7 @@
 
 It is an `.npz` of NumPy: an entry for each array, and the entry `header`, the bytes of a JSON text with the name and
 version of the format, the version of jaxbeam, and the trees of scene and solution. Functions are stored by their names.
+The outline of the solution is an entry of its own, which archives of the same version need not have.
 The comment at the end of the zip file is a SHA-256 checksum of all bytes before it.
 
 Loading imports modules of jaxbeam alone, and those that the caller trusts. The checksum finds damage, not malice: load
@@ -17,7 +18,7 @@ import os
 import struct
 import zipfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def save(path: disk.PathLike, scene: Scene, solution: Solution | None = None) ->
     file = disk.target(path)
     checks.instance("scene", scene, Scene, "make one with tendon_beam(), rod_beam() or Scene(mesh, terms, fixed, tip)")
     arrays: list[np.ndarray] = []
-    header = {
+    header: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
         "jaxbeam": importlib.import_module(OWN).__version__,
@@ -63,6 +64,7 @@ def save(path: disk.PathLike, scene: Scene, solution: Solution | None = None) ->
     }
     if solution is not None:
         check_solution(scene, solution)
+        header["outline"] = header["solution"]["fields"].pop("outline")
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with disk.whole(file) as temporary, open(temporary, "w+b") as stream:
         # NumPy writes one array after the other.
@@ -104,6 +106,8 @@ def load(path: disk.PathLike, trust: tuple[str, ...] = ()) -> tuple[Scene, Solut
             f"{header.get('jaxbeam')}; this one reads up to {VERSION}, so install that version or a later one"
         )
     try:
+        if header["solution"] is not None:
+            header["solution"]["fields"]["outline"] = header.get("outline")
         scene, solution = (decode(header[name], arrays, trusted) for name in ("scene", "solution"))
     except (KeyError, IndexError, TypeError, AttributeError) as error:
         raise _foreign(file) from error

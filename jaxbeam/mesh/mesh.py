@@ -75,7 +75,7 @@ class Mesh:
             return "a tree of other values"
         count, nodes = self.elements.shape
         kind = element_of(self.elements).name if not self.is_line else "element"
-        return f"{len(self.nodes)} nodes, {count} {kind}s of {nodes} nodes, {self.nodes.dtype}"
+        return f"{self.nodes.shape[-2]} nodes, {count} {kind}s of {nodes} nodes, {self.nodes.dtype}"
 
 
 def with_middles(mesh: Mesh, corners: np.ndarray) -> np.ndarray:

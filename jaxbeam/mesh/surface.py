@@ -119,6 +119,20 @@ def surface(mesh: Mesh) -> np.ndarray:
     return surface_of((key_of(mesh, "elements"),))
 
 
+def outline(mesh: Mesh) -> np.ndarray:
+    """The edges `(e, k)` that a mesh is drawn with, sorted: those of its surface, or the elements of a rod.
+
+    Sorted, they are the same for meshes that differ inside only, such as in their diagonals.
+    """
+    return _sorted(key_of(mesh, "elements"), mesh.is_line)
+
+
+@lru_cache(maxsize=32)
+def _sorted(elements: Key, is_line: bool) -> np.ndarray:
+    edges = elements.array if is_line else surface_of((elements,))
+    return read_only(edges[np.lexsort(edges.T[::-1])], np.int32)
+
+
 @lru_cache(maxsize=32)
 def surface_of(bodies: tuple[Key, ...]) -> np.ndarray:
     """The edges of the surface, as `surface` returns them.

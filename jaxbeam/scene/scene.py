@@ -20,17 +20,20 @@ from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import (
     Numbers,
-    holds_arrays,
     index_field,
     is_concrete,
     key_of,
+    numbers_in_words,
     pytree,
     read_only,
     replace,
+    why_unknown,
 )
 from jaxbeam.mesh.mesh import Mesh
+from jaxbeam.mesh.sketch import page
 from jaxbeam.mesh.surface import surface_of
 from jaxbeam.physics.energy import Term, check_nodes
+from jaxbeam.scene.sketch import picture
 
 
 @pytree
@@ -95,13 +98,58 @@ class Scene:
         object.__setattr__(self, "surface", surface_of(bodies))
 
     def __repr__(self) -> str:
-        if not holds_arrays(self, self.mesh.nodes):
-            return "Scene(a tree of other values)"
-        terms = ", ".join(f"{len(term.nodes)} x {term.kind.name}" for term in self.terms)
-        free = f"{int((~self.held).sum())} of {self.fixed.size} coordinates free"
-        commands = commands_of(self)
-        known = np.array2string(np.asarray(commands), precision=6) if is_concrete(commands) else "traced"
-        return f"Scene({self.mesh.summary()}; {terms}; {free}; commands {known})"
+        return f"Scene({'; '.join(_facts(self))})"
+
+    def __str__(self) -> str:
+        return "\n  ".join(["Scene", *_facts(self)])
+
+    def _repr_html_(self) -> str:
+        """A small picture of the body at rest and what acts on it, and the facts: what a notebook shows."""
+        return page(_picture(self), ["; ".join(_facts(self))])
+
+
+@usual_rules
+def _facts(scene: Scene) -> list[str]:
+    """Size, mesh, terms, unknowns and commands of a scene in words."""
+    unknown, nodes = why_unknown(scene, scene.mesh.nodes), scene.mesh.nodes
+    if unknown not in ("", "traced"):
+        return [unknown]
+    if not _is_one(scene):
+        return [f"{unknown} stack of scenes".strip(), scene.mesh.summary()]
+    size = "" if unknown else " x ".join(f"{extent:.6g}" for extent in np.ptp(np.asarray(nodes)[:, :2], axis=0)) + ", "
+    facts = [size + scene.mesh.summary(), ", ".join(f"{len(term.nodes)} x {_kind(term)}" for term in scene.terms)]
+    if is_concrete(scene.held):
+        facts.append(f"{int((~scene.held).sum())} of {scene.fixed.size} coordinates free")
+    if command_count(scene):
+        with jax.debug_nans(False), jax.debug_infs(False):
+            facts.append("commands " + (unknown or numbers_in_words(commands_of(scene))))
+    return facts
+
+
+def _kind(term: Term) -> str:
+    """The word for a stencil of a term; of a material also its density, and of a user's function its name."""
+    parts = [part for part in vars(term.kind).values() if callable(part)]
+    shown = parts[:1] if term.kind.body or term.kind is not term.energy else []
+    return " ".join([term.kind.name, *(f"({getattr(part, '__name__', type(part).__name__)})" for part in shown)])
+
+
+def _is_one(scene: Scene) -> bool:
+    """Whether it is one scene, and not a stack of many that JAX has made of some or all of its leaves."""
+    shapes = [(len(term.nodes), np.shape(leaf)) for term in scene.terms for leaf in jax.tree.leaves(term.params)]
+    if scene.mesh.nodes.ndim != 2 or any(shape[:1] != (count,) for count, shape in shapes):
+        return False
+    # The commands of a gradient by a scene may be 0 / 0.
+    with jax.debug_nans(False), jax.debug_infs(False):
+        return all(term.kind.command_of(term.params).shape == (term.command_count,) for term in commanded_terms(scene))
+
+
+@usual_rules
+def _picture(scene: Scene) -> str:
+    """SVG of a scene; empty for a stack of scenes."""
+    if why_unknown(scene, scene.mesh.nodes) or not _is_one(scene):
+        return ""
+    with jax.debug_nans(False), jax.debug_infs(False):
+        return picture(scene.mesh, scene.terms, scene.fixed, scene.held)
 
 
 def _held(fixed: np.ndarray, terms: tuple[Term, ...]) -> np.ndarray:

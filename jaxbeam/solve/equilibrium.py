@@ -30,7 +30,7 @@ from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.implicit import attach_derivative, attach_derivative_of_root, linear_gradient
 from jaxbeam.solve.newton import Newton, check_linear, check_scene_and_solver, topology
 from jaxbeam.solve.predictor import start_trail
-from jaxbeam.solve.solution import Solution
+from jaxbeam.solve.solution import Solution, outlined
 
 
 @usual_rules
@@ -61,10 +61,10 @@ def equilibrium(scene: Scene, x0: Numbers | None = None, solver: Newton = Newton
     layout = solver.linear.layout(topology(scene))
     open_scene, x = unlock(scene), start(scene, x0)
     if is_concrete(x, *jax.tree.leaves(scene)):
-        return solve_from(from_rest(open_scene, x), open_scene, layout, solver)[0]
+        return outlined(solve_from(from_rest(open_scene, x), open_scene, layout, solver)[0], scene.mesh)
     still, layout, x = lax.stop_gradient((open_scene, layout, x))
     solution, factor = solve_from(from_rest(still, x), still, layout, solver)
-    return differentiable(open_scene, layout, solution, factor, solver)
+    return outlined(differentiable(open_scene, layout, solution, factor, solver), scene.mesh)
 
 
 @usual_rules

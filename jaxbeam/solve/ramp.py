@@ -21,7 +21,7 @@ from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.predictor import start_trail
-from jaxbeam.solve.solution import Solution
+from jaxbeam.solve.solution import Solution, outlined
 
 
 @usual_rules
@@ -79,9 +79,10 @@ def ramp(scene: Scene, ratios: Numbers, steps: int = 28, solver: Newton = Newton
     end = to_device(checked_commands("ratios", scene, ratios), scene.mesh.nodes.dtype)
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     if is_concrete(end, *jax.tree.leaves(scene)):
-        return _ramp(open_scene, layout, end, steps, solver)
+        return outlined(_ramp(open_scene, layout, end, steps, solver), scene.mesh)
     path = _ramp(*lax.stop_gradient((open_scene, layout, end)), steps, solver)
-    return differentiable_rows(open_scene, layout, commands(end, steps, rest_commands(scene)), path, solver)
+    rows = commands(end, steps, rest_commands(scene))
+    return outlined(differentiable_rows(open_scene, layout, rows, path, solver), scene.mesh)
 
 
 @compiled("steps", "solver")

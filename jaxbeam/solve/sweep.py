@@ -38,7 +38,7 @@ from jaxbeam.solve.continuation import follow
 from jaxbeam.solve.equilibrium import differentiable_rows
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
 from jaxbeam.solve.predictor import STATES, Trail, predict
-from jaxbeam.solve.solution import Solution, Status
+from jaxbeam.solve.solution import Solution, Status, outlined
 
 # The most commands in a chunk.
 CHUNK = 128
@@ -98,9 +98,9 @@ def sweep(
     layout, open_scene = solver.linear.layout(topology(scene)), unlock(scene)
     size = min(CHUNK, max(1, MEMORY // (scene.mesh.nodes.size * (1 + shape[1]))))
     if is_concrete(rows, *jax.tree.leaves(scene)):
-        return _on_all_cores(open_scene, layout, np.asarray(rows), size, solver, progress)
+        return outlined(_on_all_cores(open_scene, layout, np.asarray(rows), size, solver, progress), scene.mesh)
     batch = _in_one_program(*lax.stop_gradient((open_scene, layout, rows)), min(size, shape[0]), solver)
-    return differentiable_rows(open_scene, layout, rows, batch, solver)
+    return outlined(differentiable_rows(open_scene, layout, rows, batch, solver), scene.mesh)
 
 
 # ------------------------------------------------------------------------------------------------ one chunk

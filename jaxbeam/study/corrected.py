@@ -46,7 +46,7 @@ from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene, check_commands, checked_commands, command, extent
 from jaxbeam.solve.implicit import attach_derivative, energy_gradient
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
-from jaxbeam.solve.solution import Solution
+from jaxbeam.solve.solution import Solution, outlined
 from jaxbeam.solve.sweep import assembled, partition, sweep
 from jaxbeam.study.doubt import SOFT, Doubt, doubts, softest, squashed
 from jaxbeam.study.two_meshes import States, TwoMeshes, solve_both
@@ -125,9 +125,9 @@ def corrected(
     layouts = layout_of(meshes.coarse), layout_of(meshes.fine)
     if is_concrete(rows, *jax.tree.leaves(meshes)):
         if rows.ndim == 2:
-            return _in_blocks(meshes, layouts, rows, measure, solver, progress)
+            return _outlined(_in_blocks(meshes, layouts, rows, measure, solver, progress), meshes)
         states = solve_both(unlock(meshes), layouts, rows, solver)
-        return _values(meshes, layouts, rows, states, measure, solver.linear)
+        return _outlined(_values(meshes, layouts, rows, states, measure, solver.linear), meshes)
 
     def one(row: jax.Array) -> Corrected:
         still, fixed_layouts, at = lax.stop_gradient((meshes, layouts, row))
@@ -135,7 +135,11 @@ def corrected(
         # The derivative of the adjoint needs the factor at the state itself.
         return _moving_values(meshes, layouts, row, states._replace(factor=None), measure, solver.linear)
 
-    return lax.map(one, rows) if rows.ndim == 2 else one(rows)
+    return _outlined(lax.map(one, rows) if rows.ndim == 2 else one(rows), meshes)
+
+
+def _outlined(found: Corrected, meshes: TwoMeshes) -> Corrected:
+    return found._replace(solution=outlined(found.solution, meshes.fine.mesh))
 
 
 # ------------------------------------------------------------------------------------------------ one command

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxbeam.core.tree import holds_arrays, is_concrete, pytree
+from jaxbeam.core.tree import pytree, why_unknown
 from jaxbeam.solve.solution import Solution
 
 
@@ -68,9 +68,8 @@ class Design:
     status: jax.Array
 
     def __repr__(self) -> str:
-        known = holds_arrays(self, self.status)
-        if not known or not is_concrete(self.status):
-            return f"Design({'traced' if known else 'a tree of other values'})"
+        if unknown := why_unknown(self, self.status):
+            return f"Design({unknown})"
         if np.ndim(self.status):
             flags = [DesignStatus(int(flag)).name for flag in self.status]
             words = ", ".join(f"{flags.count(name)} {name}" for name in dict.fromkeys(flags))

@@ -23,7 +23,7 @@ from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.rigid import check_held
 from jaxbeam.scene.scene import Scene, command_count, command_units, commanded_terms, rest_commands
 from jaxbeam.solve.newton import Newton, check_scene_and_solver, topology
-from jaxbeam.solve.solution import Solution
+from jaxbeam.solve.solution import Solution, outlined
 from jaxbeam.study.design import Design, DesignStatus, History
 from jaxbeam.study.expansion import Measure
 from jaxbeam.study.optimum import Answer, Problem, move_answer
@@ -97,9 +97,9 @@ def reach(
     goal = jnp.asarray(goal, scene.mesh.nodes.dtype)
     task, goals, begin = _on_host(problem, goal[None], begin, measure, int(max_solves), solver)
     found = _each_in_turn(task, goals, begin, progress)[0]
-    if is_concrete(*jax.tree.leaves((problem, goal))):
-        return found
-    return _moving(problem, goal, found, measure, solver)
+    if not is_concrete(*jax.tree.leaves((problem, goal))):
+        found = _moving(problem, goal, found, measure, solver)
+    return replace(found, solution=outlined(found.solution, scene.mesh))
 
 
 @usual_rules
@@ -132,9 +132,9 @@ def reach_each(
     task, targets, begin = _on_host(problem, goals, begin, measure, int(max_solves), solver)
     each = _each_in_turn(task, targets, begin, progress)
     found = jax.tree.map(lambda *rows: to_device(np.stack(rows)), *each)
-    if is_concrete(*jax.tree.leaves((problem, goals))):
-        return found
-    return _moving_each(problem, goals, found, measure, solver)
+    if not is_concrete(*jax.tree.leaves((problem, goals))):
+        found = _moving_each(problem, goals, found, measure, solver)
+    return replace(found, solution=outlined(found.solution, scene.mesh))
 
 
 def _problem(

@@ -17,6 +17,7 @@ from jaxbeam import files
 from jaxbeam.core.tree import replace
 from jaxbeam.files import archive, names
 from jaxbeam.scene.scene import commands_of
+from jaxbeam.solve.solution import outlined
 
 ROOT = Path(__file__).parents[2]
 
@@ -103,6 +104,25 @@ def test_a_scene_alone(tmp_path):
     scene, solution = files.load(tmp_path / "a.jb")
     identical(scene, beam())
     assert solution is None
+
+
+def test_the_outline_is_kept(tmp_path):
+    """And an archive from before solutions had one is read as well."""
+    scene = beam()
+    solution = outlined(states(scene), scene.mesh)
+    files.save(tmp_path / "a.jb", scene, solution)
+    found = files.load(tmp_path / "a.jb")
+    identical(found, (scene, solution))
+    assert not found[1].outline.flags.writeable and "<svg" in found[1]._repr_html_()
+    with np.load(tmp_path / "a.jb") as entries:
+        arrays = {name: entries[name] for name in entries.files}
+    header = json.loads(bytes(arrays["header"]))
+    assert "outline" not in header["solution"]["fields"]
+    del header["outline"]
+    with open(tmp_path / "b.jb", "w+b") as stream:
+        np.savez(stream, **arrays | {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
+        archive._seal(stream)
+    identical(files.load(tmp_path / "b.jb"), (scene, replace(solution, outline=None)))
 
 
 def test_numpy_opens_it(saved):

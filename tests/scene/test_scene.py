@@ -317,8 +317,8 @@ def test_parameters_may_be_any_pytree():
 
 def test_a_scene_prints_as_a_summary(beam):
     assert repr(jb.command(beam, [0.4, 1.0])) == (
-        "Scene(203 nodes, 336 triangles of 3 nodes, float64; 336 x solid, 2 x tendon; 392 of 406 coordinates free; "
-        "commands [0.4 1. ])"
+        "Scene(3.5 x 0.8, 203 nodes, 336 triangles of 3 nodes, float64; 336 x solid (macklin_mueller), 2 x tendon; "
+        "392 of 406 coordinates free; commands [0.4, 1])"
     )
     assert repr(beam.mesh) == "Mesh(203 nodes, 336 triangles of 3 nodes, float64)"
     assert "8 elements of 2 nodes" in repr(jb.rod_beam())

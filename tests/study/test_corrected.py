@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.mesh.surface import outline
 
 CROSSED = partial(jb.tendon_beam, 7, 3, graded=True, diagonals="crossed", anchor_width=0.25)
 CURVED = partial(jb.tendon_beam, 5, 3, order=2, graded=True, anchor_width=0.25)
@@ -64,8 +65,11 @@ def test_many_commands_are_each_like_one(terminal):
     many = jb.corrected(meshes, rows, angle_and_tension, progress=lambda *call: calls.append(call))
     assert calls == [(20, 60), (40, 60), (60, 60)] and terminal.getvalue() == ""
     jb.check(many.solution)
+    # They draw themselves on the finer mesh.
+    assert np.array_equal(many.solution.outline, outline(meshes.fine.mesh))
     for k in (0, 7, 19):
         one = jb.corrected(meshes, rows[k], angle_and_tension)
+        assert np.array_equal(one.solution.outline, many.solution.outline)
         np.testing.assert_allclose(many.value[k], one.value, rtol=1e-4)
         np.testing.assert_allclose(many.bar[k], one.bar, rtol=0.1)
     jb.corrected(meshes, rows, angle_and_tension, progress=True)

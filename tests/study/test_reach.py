@@ -12,6 +12,7 @@ from helpers import small_beam
 
 import jaxbeam as jb
 from jaxbeam.core.tree import replace
+from jaxbeam.mesh.surface import outline
 from jaxbeam.physics.tendon import TendonEnergy
 
 REACHED, UNREACHABLE, NOT_CONVERGED = jb.DesignStatus
@@ -141,6 +142,7 @@ def test_path_of_targets(beam):
     assert (np.asarray(found.status) == REACHED).all()
     np.testing.assert_allclose(found.value, targets, rtol=0, atol=1e-8)
     np.testing.assert_allclose(tip_positions(beam, found.solution.x), targets, rtol=0, atol=1e-8)
+    assert np.array_equal(found.solution.outline, outline(beam.mesh))
     assert np.asarray(found.solves)[1:].max() <= 4
     assert np.asarray(found.solution.steps)[1:].mean() < 6  # of Newton, in the last of these solves
     np.testing.assert_allclose(jb.reach(beam, targets[7], jb.tip_position).theta, found.theta[7], rtol=0, atol=1e-7)
@@ -472,6 +474,7 @@ def test_step_without_equilibrium_is_taken_back(terminal):
     status = np.asarray(found.history.status)
     assert (status[1:] & jb.Status.INVALID).any() and (status == 0).sum() > 1
     assert int(found.solution.status) == jb.Status.OK
+    assert np.array_equal(found.solution.outline, outline(small_beam().mesh))
     assert 0.3 < float(found.theta["poisson"]) < 0.5
     bad = int(np.argmax(status != 0))
     tried = np.asarray(found.history.theta["poisson"])
