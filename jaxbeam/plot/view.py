@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.widgets import Button, Slider
 
@@ -173,7 +174,7 @@ class View:
         moving = self._moving()
         self.frames += 1
         canvas: Any = self.canvas
-        if self._background is None or not canvas.supports_blit:
+        if self._background is None:
             canvas.draw()
             return
         canvas.restore_region(self._background)
@@ -184,7 +185,7 @@ class View:
     def on_draw(self, event: Any) -> None:
         """After all else was drawn: keep it as the background, and draw what moves on top."""
         canvas: Any = self.canvas
-        if canvas.supports_blit and event.canvas is canvas and not canvas.is_saving():
+        if isinstance(canvas, FigureCanvasAgg) and event.canvas is canvas and not canvas.is_saving():
             self._background = canvas.copy_from_bbox(self.figure.bbox)
         for artist in self._moving():
             artist.draw(event.renderer)

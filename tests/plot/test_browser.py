@@ -1,4 +1,4 @@
-"""The harness that drives figures in a real browser, on a figure of its own."""
+"""The window in a real browser: matplotlib's WebAgg serves it, and headless Chromium moves the mouse."""
 
 import io
 import json
@@ -8,96 +8,120 @@ import pytest
 from browser import missing, report, shown
 from PIL import Image
 
+import jaxbeam as jb
+
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
+# A pixel of the window's axes, in units of length; positions of the mouse are whole pixels.
+PIXEL = 0.012
 
-def figure():
-    """Axes from (0, 0) to (4, 2), and a slider from 0 to 10 below; every event is reported."""
+
+def beam():
+    return jb.tendon_beam(9, 3)
+
+
+def window():
+    """The window on a beam; every state that it shows is reported, with the place of the tip on the canvas."""
+    import jax
     import matplotlib.pyplot as plt
-    from matplotlib.widgets import Slider
 
-    fig = plt.figure(figsize=(6, 4), dpi=100)
-    axes, below = fig.add_axes((0.1, 0.3, 0.8, 0.6)), fig.add_axes((0.1, 0.1, 0.7, 0.05))
-    axes.set(xlim=(0, 4), ylim=(0, 2))
-    (dot,) = axes.plot([], [], "o", color="red", markersize=20)
-    fig.slider = Slider(below, "value", 0, 10, valinit=2)
-    fig.slider.on_changed(lambda value: report(name="slider", value=float(value)))
+    from jaxbeam import plot
+    from jaxbeam.plot.view import HEIGHT, WIDTH
 
-    def moved(event):
-        if event.inaxes is axes:
-            dot.set_data([event.xdata], [event.ydata])
-            fig.canvas.draw_idle()
-            report(name="moved", at=[float(event.xdata), float(event.ydata)], pressed=bool(event.buttons))
+    jax.config.update("jax_enable_x64", True)
+    figure = plt.figure(figsize=(WIDTH, HEIGHT), dpi=90)
+    opened = plot.Window(figure, beam())
+    show = opened.view.show
 
-    fig.canvas.mpl_connect("motion_notify_event", moved)
-    fig.canvas.mpl_connect("key_press_event", lambda event: report(name="key", key=event.key))
-    report(name="boxes", axes=list(axes.bbox.extents), slider=list(below.bbox.extents))
+    def told(state, sliders):
+        show(state, sliders)
+        view, to_pixels = opened.view, opened.view.axes.transData.transform
+        sliders = [slider.ax.bbox.extents.tolist() for slider in view.sliders]
+        report(
+            name="shown",
+            tip=view.tip.tolist(),
+            pixel=to_pixels(view.tip).tolist(),
+            unit=float(to_pixels((1, 0))[0] - to_pixels((0, 0))[0]),
+            commands=state.commands.tolist(),
+            x=np.asarray(state.solution.x).tolist(),
+            said=view.said,
+            field=view.picture.values is not None,
+            frames=view.frames,
+            sliders=sliders,
+            loop=[timer is not None for timer in [opened._timer]],
+        )
+
+    opened.view.show = told
+    figure.window = opened
 
 
 @pytest.fixture(scope="module")
 def page():
-    with shown(__file__, "figure") as page:
+    with shown(__file__, "window", width=1100, height=800) as page:
+        state(page, lambda event: event["said"].startswith("OK"), seconds=60)
         yield page
 
 
-def boxes(page):
-    """Boxes of the axes and of the slider on the canvas, in pixels: left, bottom, right, top."""
-    found = next(json.loads(line) for line in page.figure.lines if '"boxes"' in line)
-    return found["axes"], found["slider"]
+def state(page, found, seconds=10):
+    """The next state that is shown and has what is looked for."""
+    return page.wait_for(lambda event: event["name"] == "shown" and found(event), seconds)
 
 
-def inside(page, box, x, y):
-    """The place on the page of shares `x` and `y` of the width and height of a box."""
-    left, bottom, right, top = box
-    return page.place(left + x * (right - left), bottom + y * (top - bottom))
+def at_rest(page):
+    """Press r; the state at rest."""
+    page.press("r")
+    return state(page, lambda event: event["commands"] == [1, 1])
 
 
-def test_a_slider_follows_the_mouse(page):
-    slider = boxes(page)[1]
-    page.drag(inside(page, slider, 0.2, 0.5), inside(page, slider, 0.7, 0.5))
-    event = page.wait_for(lambda event: event["name"] == "slider" and event["value"] > 6.9)
-    # A pixel of the slider is 0.024.
-    assert event["value"] == pytest.approx(7, abs=0.03)
+def picture(page):
+    return np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def test_a_drag_arrives_in_data_coordinates(page):
-    axes = boxes(page)[0]
-    page.drag(inside(page, axes, 0.25, 0.25), inside(page, axes, 0.75, 0.5), steps=5)
-    event, passed = None, []
-    while event is None or event["at"][0] < 2.99:
-        event = page.wait_for(lambda event: event["name"] == "moved")
-        passed.append(event["at"])
-    assert event["pressed"] and event["at"] == pytest.approx([3, 1], abs=0.01)
-    assert len(passed) >= 5 and (np.diff(np.array(passed), axis=0) >= 0).all()
-    page.move(inside(page, axes, 0.5, 0.5))
-    event = page.wait_for(lambda event: event["name"] == "moved" and event["at"][0] < 2.1)
-    assert not event["pressed"] and event["at"] == pytest.approx([2, 1], abs=0.01)
+def count_of(pixels, colour, off=30):
+    return int((np.abs(pixels - colour).max(axis=-1) < off).sum())
 
 
-def test_keys_arrive(page):
-    page.click(inside(page, boxes(page)[0], 0.5, 0.9))
-    page.press("a", "left")
-    for key in ("a", "left"):
-        assert page.wait_for(lambda event: event["name"] == "key")["key"] == key
+def test_a_slider_sets_its_command(page):
+    rest = at_rest(page)
+    left, bottom, right, top = rest["sliders"][0]
+    # The slider runs from 0.4 to 1.
+    place = lambda ratio: page.place(left + (right - left) * (ratio - 0.4) / 0.6, (bottom + top) / 2)
+    page.drag(place(0.98), place(0.7), steps=8)
+    found = state(page, lambda event: abs(event["commands"][0] - 0.7) < 0.002)
+    expected = jb.check(jb.equilibrium(jb.command(beam(), found["commands"]))).x
+    np.testing.assert_allclose(found["x"], expected, atol=1e-6)
 
 
-def test_the_picture_shows_what_happened(page):
-    """The red dot is drawn where the mouse is, on the screen itself."""
-    x, y = (round(value) for value in inside(page, boxes(page)[0], 0.8, 0.2))
-    page.move((x, y))
-    page.wait_until(
-        "const c = document.querySelector('canvas.mpl-canvas'), r = c.getBoundingClientRect();"
-        "const [red, green] = c.getContext('2d').getImageData(arguments[0] - r.left, arguments[1] - r.top, 1, 1).data;"
-        "return red > 200 && green < 50",
-        x,
-        y,
-    )
-    picture = np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
-    red = (picture[..., 0] > 200) & (picture[..., 1:] < 50).all(axis=-1)
-    # A disk of 20 points at 100 dots an inch.
-    centre = np.argwhere(red[y - 20 : y + 20, x - 20 : x + 20]).mean(axis=0) - 20
-    np.testing.assert_allclose(centre, 0, atol=1.5)
-    assert picture.shape[1] == 1000 and 500 < red.sum() < 1000
+def test_the_tip_is_dragged_and_out_of_reach_stays_at_the_nearest_point(page):
+    rest = at_rest(page)
+    start = np.array(rest["pixel"])
+    goal = start + rest["unit"] * np.array([-0.4, 0.7])
+    page.drag(page.place(*start), page.place(*goal), steps=20)
+    found = state(page, lambda event: np.abs(np.array(event["pixel"]) - goal).max() < 1.5)
+    assert found["said"].startswith("OK")
+    assert found["frames"] - rest["frames"] > 5
+    expected = jb.check(jb.equilibrium(jb.command(beam(), found["commands"]))).x
+    np.testing.assert_allclose(found["x"], expected, atol=1e-6)
+    start = np.array(found["pixel"])
+    page.drag(page.place(*start), page.place(*(start + found["unit"] * np.array([0.3, 0.6]))), steps=10)
+    far = state(page, lambda event: event["said"].startswith("UNREACHABLE"))
+    assert "is at its bound" in far["said"]
+    assert count_of(picture(page), [0xC1, 0x12, 0x1F]) > 300  # the slider of the bound in the way, and the cross
+
+
+def test_a_key_shows_the_stress(page):
+    at_rest(page)
+    assert not state_after_key(page, "0")["field"]
+    plain = count_of(picture(page), [0xDC, 0xE5, 0xEE], 8)
+    assert state_after_key(page, "1")["field"]
+    coloured = picture(page)
+    assert plain > 5000 > 500 > count_of(coloured, [0xDC, 0xE5, 0xEE], 8)
+    assert not state_after_key(page, "0")["field"]
+
+
+def state_after_key(page, key):
+    page.press(key)
+    return state(page, lambda event: True)
 
 
 def test_waits_have_an_end(page):
