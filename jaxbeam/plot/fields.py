@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -47,6 +48,11 @@ class Field:
     centre: float | None = None
     colours: tuple[float, float] | None = None
     at_nodes: bool | None = None
+
+    @cached_property
+    def compiled(self) -> Callable[[Scene, jax.Array], jax.Array]:
+        """The function as a compiled program."""
+        return jax.jit(self.function())
 
     def function(self) -> Callable[[Scene, jax.Array], jax.Array]:
         """The values as a function.

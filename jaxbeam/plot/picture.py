@@ -89,7 +89,7 @@ class Picture:
         bounds = bounds or limits(*extremes(scene, positions[None]), *acting.extremes([state]))
         figure, axes = (None, [prepare(ax, bounds)]) if ax else panels(1, [bounds])
         self.scene, self.ax, self.field, self._acting = scene, axes[0], field, acting
-        self._measure = jax.jit(field.values) if field and callable(field.values) else None
+        self._measure = field.compiled if field and callable(field.values) else None
         self.values = self._values(state, field.values if field and not self._measure else None)
         (scale,) = scales_of(field, [(scene, self.values[None])]) if field and self.values is not None else (None,)
         self._panel = Panel(axes[0], acting, scale)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxbeam.core.tree import Numbers, unlock
+from jaxbeam.plot.lines import command_names
 from jaxbeam.scene.measures import tendon_lengths, tendon_tensions, tip_angle
 from jaxbeam.scene.scene import Scene, command, commands_of, rest_commands
 from jaxbeam.solve.actuation import Origin, from_neighbour, from_rest
@@ -117,8 +118,9 @@ class Steering:
         if status == DesignStatus.REACHED:
             return self._shown(found.solution, np.zeros_like(held), None, [])
         ends = np.where(held < 0, self.low, self.high)
-        ways = [f"command {k + 1} is at its bound {ends[k]:g}" for k in np.flatnonzero(held)]
-        why = ", ".join(ways) or "no command moves it nearer"
+        names = command_names(self.scene)
+        ways = [f"{names[k]} is at its bound {ends[k]:g}" for k in np.flatnonzero(held)]
+        why = ", ".join(ways) or "no command brings it nearer"
         return self._shown(found.solution, held, target, [f"UNREACHABLE: this is the nearest point; {why}"])
 
     def stay(self) -> Shown:

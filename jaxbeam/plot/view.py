@@ -105,9 +105,10 @@ class View:
         if self.steering.measure is not None:
             self._tip.set_data(*np.asarray(self.steering.measure(shown.scene, shown.solution.x))[:, None])
         self._wish.set_data(*(np.zeros((2, 0)) if shown.target is None else shown.target[:, None]))
-        for slider, held in zip(self.sliders, shown.held, strict=True):
+        for k, (slider, held) in enumerate(zip(self.sliders, shown.held, strict=True)):
             slider.label.set(color=WRONG if held else "black", fontweight="bold" if held else "normal")
             slider.track.set_facecolor(WRONG if held else "lightgrey")
+            slider.poly.set_facecolor(WRONG if held else PALETTE[k % len(PALETTE)])
         if sliders:
             self.set_sliders(shown.commands)
         width = max(len(name) for name, _ in shown.facts)

@@ -49,10 +49,11 @@ OPEN: set[Window] = set()
 
 
 class Job(NamedTuple):
-    """Something to solve, and what does it."""
+    """Something to compute: what to call it, what does it in the thread, and what is then done before it is shown."""
 
     name: str
     run: Callable[[], Shown]
+    then: Callable[[], None] = lambda: None
 
 
 class Window:
@@ -100,9 +101,9 @@ class Window:
         self._timer = figure.canvas.new_timer(interval=TICK)
         self._timer.add_callback(self.tick)
         self._connect(figure)
-        self._ask(Job("solver", self.steering.begin))
+        self._ask(Job("the solver", self.steering.begin))
         if draggable:
-            self._waiting.append(Job("search", self.steering.stay))
+            self._waiting.append(Job("the search for commands", self.steering.stay))
 
     def _connect(self, figure: Figure) -> None:
         """Have events of the canvas and the widgets call the methods below."""
@@ -124,16 +125,16 @@ class Window:
         """Set the commands `(m,)`, as the sliders do."""
         wanted = np.asarray(commands, float)
         self.view.set_sliders(wanted)
-        self._ask(Job("solver", lambda: self.steering.set(wanted)))
+        self._ask(Job("the solver", lambda: self.steering.set(wanted)))
 
     def drag(self, target: Numbers) -> None:
         """Bring the tip to `target` `(2,)`, as the mouse does."""
         wanted = np.asarray(target, float)
-        self._ask(Job("search", lambda: self.steering.drag(wanted)))
+        self._ask(Job("the search for commands", lambda: self.steering.drag(wanted)))
 
     def rest(self, event: Event | None = None) -> None:
         """Go back to rest."""
-        self._ask(Job("solver", self.steering.rest))
+        self._ask(Job("the solver", self.steering.rest))
 
     def colour(self, key: str) -> None:
         """Show stress (`"1"`), `J` (`"2"`), energy (`"3"`) or none of them (`"0"`)."""
@@ -144,10 +145,21 @@ class Window:
             except ValueError as error:
                 self.view.say(f"no {field.label}: {error}", wrong=True)
                 return
-        self.view.field = field
-        if self.shown:
-            self.view.draw_anew(self.shown.scene, np.asarray(self.shown.solution.x))
-            self.view.show(self.shown, sliders=False)
+        shown = self.shown
+        if shown is None:
+            self.view.field = field
+            return
+
+        def run() -> Shown:
+            if field:
+                jax.block_until_ready(field.compiled(shown.scene, shown.solution.x))
+            return shown
+
+        def then() -> None:
+            self.view.field = field
+            self.view.draw_anew(shown.scene, np.asarray(shown.solution.x))
+
+        self._ask(Job(field.label if field else "plain picture", run, then))
 
     def wait(self) -> Window:
         """Wait until all that was asked for is drawn, compilation included: for scripts, where no window runs."""
@@ -208,11 +220,11 @@ class Window:
             job = self._waiting.pop(0)
             self._running = job, self._pool.submit(self._solve, job), time.monotonic()
             if job.name not in self._compiled:
-                self.view.say(f"compiling the {job.name}: this takes a few seconds")
+                self.view.say(f"compiling: {job.name} ...")
         elif (
             self._running and time.monotonic() - self._running[2] > PATIENCE and self._running[0].name in self._compiled
         ):
-            self.view.say("solving ...")
+            self.view.say(f"waiting for {self._running[0].name} ...")
             self._running = *self._running[:2], np.inf
         if not self._running and not self._waiting:
             self._timer.stop()
@@ -228,6 +240,7 @@ class Window:
         except Exception as error:  # the window must live on; what went wrong is shown in it
             self.view.say(f"{type(error).__name__}: {error}", wrong=True)
         else:
+            job.then()
             # A slider that is being moved is ahead of what is drawn.
             moving = any(slider.drag_active for slider in self.view.sliders)
             self.view.show(self.shown, sliders=not moving)

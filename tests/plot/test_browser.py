@@ -1,7 +1,6 @@
 """The window in a real browser: matplotlib's WebAgg serves it, and headless Chromium moves the mouse."""
 
 import io
-import json
 
 import numpy as np
 import pytest
