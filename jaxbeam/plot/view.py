@@ -50,13 +50,15 @@ class View:
         rows = len(names) * ROW / height
         self.axes = figure.add_axes((0.075, rows + 0.65 / height, 0.565, 1 - rows - 0.8 / height))
         left, top = 0.765, 1 - 0.2 / height
-        look: dict[str, Any] = {"va": "top", "animated": True, "fontsize": 9}
-        self._facts = figure.text(left, top, "", family="monospace", linespacing=1.5, **look)
-        self._status = figure.text(left, top - 1.7 / height, "", linespacing=1.35, **look)
+        look: dict[str, Any] = {"va": "top", "fontsize": 9, "linespacing": 1.5}
+        self._names = figure.text(left, top, "", **look)
+        self._facts = figure.text(left + 0.095, top, "", animated=True, **look)
+        self._status = figure.text(left, top - 1.7 / height, "", **look)
         figure.text(0.985, 0.08 / height, HINT, fontsize=7.5, color="0.4", va="bottom", ha="right")
         self.sliders = [
             self._slider(k, name, rows - (k + 0.8) * ROW / height + 0.08 / height) for k, name in enumerate(names)
         ]
+        self._held = np.zeros(len(names), int)
         self.button = Button(figure.add_axes((left, 0.4 / height, 0.09, 0.3 / height)), "rest")
         rest = np.asarray(steering.scene.mesh.nodes)
         self._grows = bounds is None
@@ -70,7 +72,8 @@ class View:
         look: dict[str, Any] = {"valfmt": "%.4g", "color": PALETTE[k % len(PALETTE)], "initcolor": "none"}
         slider = Slider(ax, name, *map(float, ends), valinit=float(self.steering.start[k]), **look)
         slider.drawon = False
-        ax.set_animated(True)
+        for artist in (slider.poly, slider.valtext, *ax.lines):
+            artist.set_animated(True)
         return slider
 
     @property
@@ -105,23 +108,35 @@ class View:
         if self.steering.measure is not None:
             self._tip.set_data(*np.asarray(self.steering.measure(shown.scene, shown.solution.x))[:, None])
         self._wish.set_data(*(np.zeros((2, 0)) if shown.target is None else shown.target[:, None]))
-        for k, (slider, held) in enumerate(zip(self.sliders, shown.held, strict=True)):
-            slider.label.set(color=WRONG if held else "black", fontweight="bold" if held else "normal")
-            slider.track.set_facecolor(WRONG if held else "lightgrey")
-            slider.poly.set_facecolor(WRONG if held else PALETTE[k % len(PALETTE)])
+        self._light(shown.held)
         if sliders:
             self.set_sliders(shown.commands)
-        width = max(len(name) for name, _ in shown.facts)
-        self._facts.set_text("\n".join(f"{name:<{width}}  {text}" for name, text in shown.facts))
+        self._facts.set_text("\n".join(text for _, text in shown.facts))
+        names = "\n".join(name for name, _ in shown.facts)
+        if names != self._names.get_text():
+            self._names.set_text(names)
+            self._background = None
         if shown.reasons:
             self.say("\n".join(shown.reasons), wrong=True)
         else:
             self.say("OK: converged, stable, not inverted", good=True)
 
+    def _light(self, held: np.ndarray) -> None:
+        """Show the sliders of bounds that are in the way, where `held` `(m,)` is not 0, in red."""
+        if np.array_equal(held, self._held):
+            return
+        self._held, self._background = held, None
+        for k, slider in enumerate(self.sliders):
+            slider.label.set(color=WRONG if held[k] else "black", fontweight="bold" if held[k] else "normal")
+            slider.track.set_facecolor(WRONG if held[k] else "lightgrey")
+            slider.poly.set_facecolor(WRONG if held[k] else PALETTE[k % len(PALETTE)])
+
     def say(self, text: str, *, good: bool = False, wrong: bool = False) -> None:
         """Show a text beside the picture."""
-        lines = [wrapped for line in text.split("\n") for wrapped in textwrap.wrap(line, LINE)]
-        self._status.set(text="\n".join(lines), color=WRONG if wrong else GOOD if good else OUTLINE)
+        lines = "\n".join(wrapped for line in text.split("\n") for wrapped in textwrap.wrap(line, LINE))
+        if lines != self._status.get_text():
+            self._status.set(text=lines, color=WRONG if wrong else GOOD if good else OUTLINE)
+            self._background = None
         self.redraw()
 
     @property
@@ -165,10 +180,12 @@ class View:
 
     def _moving(self) -> list[Artist]:
         """What is drawn anew in each frame, from the lowest to the highest."""
-        found: list[Artist] = [*self.picture.artists, self._tip, self._wish, self._facts, self._status]
+        found: list[Artist] = [*self.picture.artists, self._tip, self._wish, self._facts]
         for artist in found:
             artist.set_animated(True)
-        return found + [slider.ax for slider in self.sliders]
+        for slider in self.sliders:
+            found += [slider.poly, *slider.ax.lines, slider.valtext]
+        return found
 
     def redraw(self) -> None:
         """Draw a frame."""

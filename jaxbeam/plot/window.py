@@ -39,7 +39,10 @@ FIELDS: dict[str, Field | None] = {
     "3": Field(lambda scene, x: to_nodes(scene, strain_energy_density(scene, x)), "strain energy density"),
 }
 # Milliseconds between two looks at the thread; seconds until a solve is said to go on.
-TICK, PATIENCE = 10, 0.3
+TICK, PATIENCE = 5, 0.3
+# Time without drawing after a frame, over the time that the frame took. All that the mouse did meanwhile is then taken
+# in at once. Without it a browser gets a frame for each of its moves, and the tip lags more and more behind the mouse.
+BREATH = 0.25
 # How near to the tip, in points, the mouse must be to take it.
 GRIP = 18.0
 # Backends of notebooks that show a still picture.
@@ -98,6 +101,7 @@ class Window:
         self._running: tuple[Job, Future[Shown], float] | None = None
         self._waiting: list[Job] = []
         self._compiled: set[str] = set()
+        self._free = 0.0  # when the next frame may be drawn
         self._timer = figure.canvas.new_timer(interval=TICK)
         self._timer.add_callback(self.tick)
         self._connect(figure)
@@ -166,6 +170,7 @@ class Window:
         while self._running or self._waiting:
             if self._running:
                 wait([self._running[1]])
+            time.sleep(max(0.0, self._free - time.monotonic()))
             self.tick()
         return self
 
@@ -212,22 +217,31 @@ class Window:
 
     def tick(self) -> None:
         """Look whether a solve has ended, draw its result, and begin the next one."""
-        if self._running and self._running[1].done():
-            (job, future, _), self._running = self._running, None
-            self._compiled.add(job.name)
-            self._finish(job, future)
+        free = time.monotonic() >= self._free
+        ended = self._running if free and self._running and self._running[1].done() else None
+        if ended:
+            self._running = None
+            self._compiled.add(ended[0].name)
+        # Begin the next solve before the last one is drawn: both go on at once.
         if self._waiting and not self._running:
-            job = self._waiting.pop(0)
-            self._running = job, self._pool.submit(self._solve, job), time.monotonic()
-            if job.name not in self._compiled:
-                self.view.say(f"compiling: {job.name} ...")
-        elif (
-            self._running and time.monotonic() - self._running[2] > PATIENCE and self._running[0].name in self._compiled
-        ):
-            self.view.say(f"waiting for {self._running[0].name} ...")
-            self._running = *self._running[:2], np.inf
+            self._begin(self._waiting.pop(0))
+        if ended:
+            begun = time.monotonic()
+            self._finish(*ended[:2])
+            ready = time.monotonic()
+            self._free = ready + BREATH * (ready - begun)
+        if self._running and time.monotonic() - self._running[2] > PATIENCE:
+            job, future, _ = self._running
+            self._running = job, future, np.inf  # this is said once
+            if job.name in self._compiled:
+                self.view.say(f"waiting for {job.name} ...")
         if not self._running and not self._waiting:
             self._timer.stop()
+
+    def _begin(self, job: Job) -> None:
+        self._running = job, self._pool.submit(self._solve, job), time.monotonic()
+        if job.name not in self._compiled:
+            self.view.say(f"compiling: {job.name} ...")
 
     def _solve(self, job: Job) -> Shown:
         # `jax.enable_x64` as a context holds only in the thread that entered it.
