@@ -1,6 +1,7 @@
 """Scenes of one small beam with something that acts on it, and what a picture of them holds."""
 
 import numpy as np
+from matplotlib.collections import PolyCollection
 
 import jaxbeam as jb
 
@@ -39,6 +40,14 @@ def arrows(ax, row=False):
 def is_row(ax, heads):
     shafts = ax.collections[list(ax.collections).index(heads) - 1]
     return float(shafts.get_linewidths()[0]) < 1
+
+
+def triangles(ax):
+    """Tips `(q, 2)` of the triangles at supported nodes, and the directions `(q, 2)` from there to the ground."""
+    (found,) = (c for c in ax.collections if c.get_zorder() == 7 and isinstance(c, PolyCollection))
+    corners = np.array([path.vertices[:3] for path in found.get_paths()])
+    away = corners[:, 1:].mean(axis=1) - corners[:, 0]
+    return corners[:, 0], away / np.linalg.norm(away, axis=1, keepdims=True)
 
 
 def legend(ax):

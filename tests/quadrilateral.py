@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+import jaxbeam as jb
 from jaxbeam.mesh.bernstein import array_module
 from jaxbeam.mesh.element import Determinant, Element
 
@@ -148,3 +149,10 @@ QUADRILATERAL = Element(
     gains=(0.73, 0.1),
     spread=0.33,
 )
+
+
+def quadrilaterals(mesh: jb.Mesh) -> jb.Mesh:
+    """A mesh of six-node triangles, two in each cell, as one of quadrilaterals with the same nodes."""
+    lower, upper = np.asarray(mesh.elements)[::2].T, np.asarray(mesh.elements)[1::2].T
+    corners, between = [lower[0], lower[1], lower[2], upper[2]], [lower[3], lower[4], upper[4], upper[5]]
+    return jb.Mesh(np.asarray(mesh.nodes), np.stack([*corners, *between, lower[5]], axis=1))

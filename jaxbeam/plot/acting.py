@@ -5,18 +5,20 @@ All forces of a picture have one scale. Forces per length, which are in another 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.core.compiling import COMPILER_OPTIONS, one_program, usual_rules
 from jaxbeam.mesh.element import edge_functions, edge_slopes
 from jaxbeam.mesh.surface import CORNER
 from jaxbeam.physics.energy import Term
-from jaxbeam.plot.lines import edge_curves, extremes, outline
+from jaxbeam.plot.lines import clearance, extremes, inside, outline, segments
+from jaxbeam.plot.springs import Springs
 from jaxbeam.scene.scene import Scene, command
 
 # Lengths relative to the extent of the body: the longest arrow of a force, the longest one of a row, the distance of
@@ -27,11 +29,11 @@ ARROW, ROW, SPACING, GAP = 0.1, 0.06, 0.04, 0.015
 ROOM, QUANTILE = 0.33, 0.2
 # Cosine of the angle between force and surface normal below which arrows lie along the surface.
 ALONG = 0.3
-# Springs: length of one whose node stays, times the displacement that is added, longest; width and number of teeth.
-SPRING, FURTHER, LONGEST, TOOTH, TEETH = 0.055, 1.5, 0.4, 0.011, 4
 # How much of an obstacle limits of axes hold, relative to the body: it is looked for up to this far away, and shown
 # between these depths.
 REACH, SHALLOW, DEEP = 0.2, 0.02, 0.08
+# Number of points for which the distance from an obstacle is computed in one go.
+CHUNK = 8192
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -40,8 +42,8 @@ class Row(NamedTuple):
     """Arrows evenly spaced along one smooth run of edges of a term: on its stencils `(r,)`, at `xi` `(r,)` of each."""
 
     term: int
-    stencils: np.ndarray
-    xi: np.ndarray
+    stencils: tuple[int, ...]
+    xi: tuple[float, ...]
 
 
 class Acted(NamedTuple):
@@ -77,32 +79,35 @@ class Acting:
         rest = np.asarray(scene.mesh.nodes)
         self.scene, self.rest, self.edges = scene, rest[:, :2], outline(scene)
         self.size = float(np.ptp(self.rest, axis=0).max())
-        self.loaded = [k for k, term in enumerate(scene.terms) if _point_loads(term, rest) is not None]
-        self.rows = [row for k, term in enumerate(scene.terms) for row in _rows(k, term, rest, SPACING * self.size)]
-        probe = jnp.zeros((1, 2), rest.dtype)
-        self.rigid = [k for k, term in enumerate(scene.terms) if term.kind.obstacle(probe, term.params) is not None]
-        self.tied, self.tied_to, self.tooth = _tied(scene, self.size)
-        self.bases, self.farthest = np.zeros((0, 2)), np.zeros((len(self.tied), 2))
+        shape = usual_rules(jax.eval_shape)
+        has = lambda of, at: [k for k, term in enumerate(scene.terms) if shape(of, term, at) is not None]
+        self.loaded = has(_point_loads, rest)
+        pushed = has(
+            lambda term, x: term.kind.edge_loads(x[term.nodes], term.params, np.full(len(term.nodes), 0.5)), rest
+        )
+        self.rows = [row for k in pushed for row in _rows(k, scene.terms[k], rest, SPACING * self.size)]
+        of = {k: [row for row in self.rows if row.term == k] for k in pushed}
+        join = lambda each: tuple(itertools.chain(*each))
+        self.joined = tuple(Row(k, join(r.stencils for r in rows), join(r.xi for r in rows)) for k, rows in of.items())
+        self.rigid = has(_distance, np.zeros((1, 2), rest.dtype))
+        self.springs = Springs(scene, self.rest, self.edges)
         self.scales = np.full(2, np.inf)
 
     @property
     def any(self) -> bool:
         """Whether anything acts, so that states must be seen."""
-        return bool(self.loaded or self.rows or self.rigid or len(self.tied))
+        return bool(self.loaded or self.rows or self.rigid or len(self.springs.nodes))
 
     def see(self, scene: Scene, x: np.ndarray) -> Acted:
         """What acts in a state: the scene under the commands of this state, and positions `(n, d)`."""
-        found = [_point_loads(scene.terms[k], x) for k in self.loaded]
-        at, force = np.concatenate([np.zeros((0, 2, 2)), *(each for each in found if each is not None)]).swapaxes(0, 1)
-        state = Acted(scene, x, at, force, [self._row(scene.terms[row.term], x, row) for row in self.rows])
+        found, along = _forces(scene, x, tuple(self.loaded), self.joined) if self.loaded or self.rows else ([], [])
+        at, force = np.concatenate([np.zeros((0, 2, 2)), *found]).swapaxes(0, 1)
+        ends = np.cumsum([len(row.xi) for row in self.rows])
+        loads = np.split(np.concatenate([np.zeros((0, 2)), *along]), ends[:-1])
+        rows = [self._row(x, row, load) for row, load in zip(self.rows, loads, strict=False)]
+        state = Acted(scene, x, at, force, rows)
         self._rescale(state)
-        if len(self.tied):
-            moved = x[self.tied, :2] - self.tied_to
-            farther = np.linalg.norm(moved, axis=1) >= np.linalg.norm(self.farthest, axis=1)
-            self.farthest = np.where(farther[:, None], moved, self.farthest)
-            long = SPRING * self.size + FURTHER * np.linalg.norm(self.farthest, axis=1)
-            long = np.minimum(long, LONGEST * self.size)
-            self.bases = self.tied_to + long[:, None] * _outward(self.rest, self.edges, self.tied, self.farthest)
+        self.springs.see(x)
         return state
 
     def see_all(self, commands: np.ndarray, x: np.ndarray) -> list[Acted]:
@@ -110,29 +115,22 @@ class Acting:
         scenes = [command(self.scene, row) for row in commands] if self.any else [self.scene] * len(x)
         return [self.see(scene, here) for scene, here in zip(scenes, x, strict=True)]
 
-    def _row(self, term: Term, x: np.ndarray, row: Row) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        nodes, k = x[term.nodes[row.stencils]], term.nodes.shape[1]
-        ends = nodes[..., :2]
-        params = jax.tree.map(lambda leaf: np.asarray(leaf)[row.stencils], term.params)
-        along = np.einsum("mk,mkd->md", edge_slopes(k, row.xi), ends)
+    def _row(self, x: np.ndarray, row: Row, load: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nodes, xi = self.scene.terms[row.term].nodes[list(row.stencils)], np.array(row.xi)
+        ends, k = x[nodes, :2], nodes.shape[1]
+        along = np.einsum("mk,mkd->md", edge_slopes(k, xi), ends)
         outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-        at = np.einsum("mk,mkd->md", edge_functions(k, row.xi), ends)
-        return at, np.asarray(term.kind.edge_loads(nodes, params, row.xi)), outward
+        return np.einsum("mk,mkd->md", edge_functions(k, xi), ends), load, outward
 
     def _rescale(self, state: Acted) -> None:
         """Shorten the arrows if the longest one of a force, or of a row, is now longer than it may be."""
         most = np.linalg.norm(state.force, axis=1).max(initial=0.0)
         rooms = [(0, ARROW * self.size, most)]
         for at, load, outward in state.rows:
-            clear = ROOM * _quantile(_clearance(at, outward, self._pieces(state)))
+            clear = ROOM * _quantile(clearance(at, outward, segments(state.x, self.edges)))
             rooms.append((1, min(ROW * self.size, clear), np.linalg.norm(load, axis=1).max()))
         for k, room, most in rooms:
             self.scales[k] = min(self.scales[k], room / most if most > 0 else np.inf)
-
-    def _pieces(self, state: Acted) -> np.ndarray:
-        """Segments `(e, 2, 2)` of the outline."""
-        curves = edge_curves(state.x, self.edges)
-        return np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 2)
 
     @property
     def names(self) -> list[str]:
@@ -152,7 +150,7 @@ class Acting:
         if not len(at) or self.scene.mesh.is_line:
             return np.stack([at, at + long], axis=1)
         samples = np.array([0.3, 0.6, 0.95])[:, None, None] * long
-        pulled, pushed = (_inside(at + sign * samples, self._pieces(state)).sum(axis=0) for sign in (1, -1))
+        pulled, pushed = (inside(at + sign * samples, segments(state.x, self.edges)).sum(axis=0) for sign in (1, -1))
         tails = at - np.where((pushed < pulled)[:, None], long, 0)
         return np.stack([tails, tails + long], axis=1)
 
@@ -182,22 +180,13 @@ class Acting:
 
     def obstacles(self, state: Acted) -> list[Distance]:
         """For each obstacle the distance from it, a function of points `(..., 2)`."""
-        return [partial(_distance, state.scene.terms[k], state.x.dtype) for k in self.rigid]
-
-    def zigzags(self, state: Acted) -> np.ndarray:
-        """Points `(q, p, 2)` of each spring, from its base outside the body to its node."""
-        start, run = self.bases, state.x[self.tied, :2] - self.bases
-        across = np.stack([-run[:, 1], run[:, 0]], axis=1)
-        across = self.tooth * across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-        along = np.array([0.0, *np.linspace(0.2, 0.8, 2 * TEETH + 1), 1.0])
-        side = np.array([0.0, 0.0, *np.resize([1.0, -1.0], 2 * TEETH - 1), 0.0, 0.0])
-        return start[:, None] + along[:, None] * run[:, None] + side[:, None] * across[:, None]
+        return [partial(_distances, state.scene.terms[k], state.x.dtype) for k in self.rigid]
 
     def extremes(self, states: Sequence[Acted]) -> list[np.ndarray]:
         """Points `(..., 2)` that span all of this in these states; of obstacles, what is near."""
         if not self.any:
             return []
-        found = [self.bases, *self._rims(states)]
+        found = [self.springs.bases, *self._rims(states)]
         for state in states:
             found += [self.arrows(state), *(arrows for arrows, _ in self.combs(state))]
         return found
@@ -211,9 +200,9 @@ class Acting:
         size = (high - low).max()
         grid = np.meshgrid(*np.linspace(low - REACH * size, high + REACH * size, 61).T)
         points = np.stack([each.ravel() for each in grid], axis=1)
-        points = points[((low <= points) & (points <= high)).any(axis=1)]
+        beside = ((low <= points) & (points <= high)).any(axis=1)
         depths = [-distance(points) / size for state in states for distance in self.obstacles(state)]
-        return [points[(depth > SHALLOW) & (depth < DEEP)] for depth in depths]
+        return [points[beside & (depth > SHALLOW) & (depth < DEEP)] for depth in depths]
 
 
 def to_one_scale(each: Sequence[Acting]) -> Sequence[Acting]:
@@ -224,21 +213,39 @@ def to_one_scale(each: Sequence[Acting]) -> Sequence[Acting]:
     return each
 
 
-def _point_loads(term: Term, x: np.ndarray) -> np.ndarray | None:
-    found = term.kind.point_loads(x[term.nodes], term.params)
-    return None if found is None else np.asarray(found)
+def _point_loads(term: Term, x: jax.Array) -> jax.Array | None:
+    return term.kind.point_loads(x[term.nodes], term.params)
 
 
-def _distance(term: Term, dtype: Any, points: np.ndarray) -> np.ndarray:
-    flat = jnp.asarray(points.reshape(-1, 2), dtype)
-    return np.asarray(term.kind.obstacle(flat, term.params)).reshape(points.shape[:-1])
+# One program for each topology: called one by one, the operations took most of the time of a moved picture.
+@usual_rules
+@partial(jax.jit, static_argnums=(2, 3), compiler_options=COMPILER_OPTIONS)
+def _forces(scene: Scene, x: jax.Array, loaded: tuple[int, ...], rows: tuple[Row, ...]) -> tuple[list[Any], list[Any]]:
+    """The outer forces `(q, 2, 2)` of each loaded term, and the forces per length `(r, 2)` on each row."""
+    on_rows = []
+    for row in rows:
+        term, stencils = scene.terms[row.term], np.array(row.stencils)
+        params = jax.tree.map(lambda leaf, stencils=stencils: leaf[stencils], term.params)
+        on_rows.append(term.kind.edge_loads(x[term.nodes[stencils]], params, np.array(row.xi)))
+    return [_point_loads(scene.terms[k], x) for k in loaded], on_rows
+
+
+@one_program
+def _distance(term: Term, points: jax.Array) -> jax.Array | None:
+    """Distances `(p,)` of points `(p, 2)` from the obstacle of a term; None if it has none."""
+    return term.kind.obstacle(points, term.params)
+
+
+def _distances(term: Term, dtype: Any, points: np.ndarray) -> np.ndarray:
+    """Distances of points `(..., 2)`, some at a time, so that one program serves grids of all shapes."""
+    flat = points.reshape(-1, 2).astype(dtype)
+    padded: Any = np.pad(flat, ((0, -len(flat) % CHUNK), (0, 0)), mode="edge").reshape(-1, CHUNK, 2)
+    found = np.concatenate([np.asarray(_distance(term, part)) for part in padded])
+    return found[: len(flat)].reshape(points.shape[:-1])
 
 
 def _rows(number: int, term: Term, rest: np.ndarray, spacing: float) -> list[Row]:
     """The rows of arrows of a term: one for each run of its edges that has no corner."""
-    half = np.full(len(term.nodes), 0.5)
-    if term.kind.edge_loads(rest[term.nodes], term.params, half) is None:
-        return []
     starts, ends = np.asarray(term.nodes)[:, :2].T
     chords = rest[ends, :2] - rest[starts, :2]
     length = np.linalg.norm(chords, axis=1)
@@ -262,70 +269,10 @@ def _rows(number: int, term: Term, rest: np.ndarray, spacing: float) -> list[Row
         s = passed[-1] * (np.linspace(0, 1, count + 1) if free else (np.arange(count) + 0.5) / count)
         where = np.clip(np.searchsorted(passed, s, side="right") - 1, 0, len(run) - 1)
         stencils = np.array(run)[where]
-        found.append(Row(number, stencils, (s - passed[where]) / length[stencils]))
+        xi = (s - passed[where]) / length[stencils]
+        found.append(Row(number, tuple(stencils.tolist()), tuple(xi.tolist())))
     return found
-
-
-def _inside(points: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-    """Whether points `(..., 2)` lie inside the closed lines that segments `(e, 2, 2)` make, by crossings of a ray."""
-    (ax, ay), (bx, by) = pieces.transpose(1, 2, 0)
-    px, py = points[..., :1], points[..., 1:]
-    crossed = (ay > py) != (by > py)
-    rise = np.where(by == ay, 1, by - ay)
-    return np.count_nonzero(crossed & (px < ax + (py - ay) * (bx - ax) / rise), axis=-1) % 2 == 1
-
-
-def _clearance(at: np.ndarray, outward: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-    """How far `(r,)` the body is away from points `at` of its surface, seen along the normals; infinite if it is not.
-
-    Solves `at + t outward = start + s run` for each of the segments `pieces` `(e, 2, 2)`.
-    """
-    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    run, gap = pieces[:, 1] - pieces[:, 0], pieces[:, 0] - at[:, None]
-    turn = cross(outward[:, None], run)
-    faces = turn < 0  # it shows its outer side, as those of the same surface do not
-    safe = np.where(faces, turn, 1)
-    t, s = cross(gap, run) / safe, cross(gap, outward[:, None]) / safe
-    small = 1e-6 * np.ptp(pieces[:, 0], axis=0).max()
-    return np.where(faces & (t > small) & (s >= 0) & (s <= 1), t, np.inf).min(axis=1)
 
 
 def _quantile(lengths: np.ndarray) -> float:
     return float(np.sort(lengths)[int(QUANTILE * len(lengths))])  # np.quantile turns infinite ones into NaN
-
-
-def _tied(scene: Scene, size: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Nodes `(q,)` that springs hold, the points `(q, 2)` they are tied to, and how far the teeth stand out."""
-    found = [(np.asarray(term.nodes)[:, 0], term.kind.springs(term.params)) for term in scene.terms]
-    held = [(nodes, np.asarray(points)) for nodes, points in found if points is not None]
-    if not held:
-        return np.zeros(0, int), np.zeros((0, 2)), 0.0
-    points = np.concatenate([each for _, each in held])
-    gaps = np.linalg.norm(points[:, None] - points, axis=2)
-    nearest = gaps[gaps > 1e-9 * size].min(initial=np.inf)
-    return np.concatenate([each for each, _ in held]), points, float(min(TOOTH * size, 0.3 * nearest))
-
-
-def _outward(rest: np.ndarray, edges: np.ndarray, nodes: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Unit vectors `(q, 2)` out of the body at `nodes`, for springs that hold them while they have `moved` `(q, 2)`.
-
-    They are normal to the edges between the nodes, or to all edges of a node that is alone. At a corner the edge
-    that moves along its normal counts more. At a node inside the body they are down.
-    """
-    along = rest[edges[:, 1]] - rest[edges[:, 0]]
-    normals = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    units = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    motion, every, between = np.zeros_like(rest), np.zeros_like(rest), np.zeros_like(rest)
-    motion[nodes] = moved
-    both = np.isin(edges[:, :2], nodes).all(axis=1)
-    for node in edges.T:
-        across = 1e-3 * np.ptp(rest, axis=0).max() + np.abs(np.sum(units * motion[node], axis=1))
-        weighted = across[:, None] ** 2 * normals
-        np.add.at(every, node, weighted)
-        np.add.at(between, node[both], weighted[both])
-    found = np.broadcast_to(np.array([0.0, -1.0]), (len(nodes), 2))
-    for better in (every[nodes], between[nodes]):
-        length = np.linalg.norm(better, axis=1, keepdims=True)
-        there = length > 1e-12 * length.max()
-        found = np.where(there, better / np.where(there, length, 1), found)
-    return found

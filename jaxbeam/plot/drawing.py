@@ -32,6 +32,7 @@ from jaxbeam.plot.lines import (
     term_lines,
 )
 from jaxbeam.plot.loads import force_handle
+from jaxbeam.plot.supports import Supports
 from jaxbeam.scene.scene import Scene, commanded_terms, placed
 
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
@@ -103,14 +104,13 @@ class Body:
         self.held = LineCollection([], colors=[colours[k] for k in pulling] or OUTLINE, linewidths=width, zorder=4)
         for collection in (ghost, self.body, self.outline, self.held):
             ax.add_collection(collection, autolim=False)
-        _draw_clamp(ax, scene, self.edges)
-        self.supported = np.flatnonzero((scene.held & ~scene.fixed).any(axis=1))
-        (self.supports,) = ax.plot([], [], "s", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=7)
+        self.supports = Supports(ax, scene, self.edges)
         self.tendons: list[Line2D] = []
         for colour in colours:
             self.tendons += ax.plot([], [], color=colour, linewidth=2.0, marker="o", markersize=4, zorder=5)
         (self.guides,) = ax.plot([], [], "o", color=OUTLINE, markerfacecolor="white", markersize=4, zorder=6)
-        self.artists: list[Artist] = [self.body, self.outline, self.held, *self.tendons, self.guides, self.supports]
+        self.artists: list[Artist] = [self.body, self.outline, self.held, *self.tendons, self.guides]
+        self.artists += self.supports.artists
         self.smooth: Smooth | None = None
         self.trusted, self.bare = True, False
         if scale:
@@ -155,7 +155,7 @@ class Body:
                 self.body.set_array(values[self.elements].mean(axis=1) if at_nodes else values)
         self.outline.set_segments(list(edge_curves(x, self.edges)))
         self.held.set_segments(list(arms(self.scene, x) if self.rod else edge_curves(x, self.patches, self.shares)))
-        self.supports.set_data(*x[self.supported, :2].T)
+        self.supports.move(x)
         paths = term_lines(self.scene, x)
         # A line with fewer points than others repeats its end, which is no guide.
         guides = [path[1:-1][(path[1:-1] != path[-1]).any(axis=1)] for path in paths]
@@ -187,22 +187,6 @@ def positions_of(scene: Scene, x: Numbers) -> np.ndarray:
     if not np.isfinite(positions).all():
         raise ValueError("x: some positions are not finite and cannot be drawn; see check(solution)")
     return positions
-
-
-def _draw_clamp(ax: Axes, scene: Scene, edges: np.ndarray) -> None:
-    """Hatching outside every boundary edge whose ends are fixed, and a square on every other fixed node."""
-    rest = np.asarray(scene.mesh.nodes)
-    walls = edges[scene.fixed[edges].all(axis=(1, 2))]
-    lonely = np.setdiff1d(np.flatnonzero(scene.fixed.any(axis=1)), walls)
-    ax.plot(*rest[lonely, :2].T, "s", color=OUTLINE, markersize=4, zorder=7)
-    lines = edge_curves(rest, walls)
-    along = np.gradient(lines, axis=1)
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    outward *= 0.025 * np.ptp(rest[:, :2], axis=0).max() / np.linalg.norm(outward, axis=-1, keepdims=True)
-    strips = np.concatenate([lines, (lines + outward)[:, ::-1]], axis=1)
-    hatching = PolyCollection(list(strips), facecolor="none", edgecolor=OUTLINE, linewidth=0, hatch="//////", zorder=1)
-    ax.add_collection(hatching, autolim=False)
-    ax.add_collection(LineCollection(list(lines), colors=OUTLINE, linewidths=2.2, zorder=4), autolim=False)
 
 
 def prepare(ax: Axes, bounds: Limits) -> Axes:

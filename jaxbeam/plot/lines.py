@@ -114,3 +114,33 @@ def patches(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     columns = zip(*found, strict=True) if found else ([], [], [])
     reached, shares, numbers = (np.array(column) for column in columns)
     return reached.astype(int).reshape(-1, edges.shape[1]), shares, numbers.astype(int)
+
+
+def segments(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The straight segments `(e, 2, 2)` that edges are drawn as."""
+    curves = edge_curves(x, edges)
+    return np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 2)
+
+
+def inside(points: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    """Whether points `(..., 2)` lie inside the closed lines that segments `(e, 2, 2)` make, by crossings of a ray."""
+    (ax, ay), (bx, by) = pieces.transpose(1, 2, 0)
+    px, py = points[..., :1], points[..., 1:]
+    crossed = (ay > py) != (by > py)
+    rise = np.where(by == ay, 1, by - ay)
+    return np.count_nonzero(crossed & (px < ax + (py - ay) * (bx - ax) / rise), axis=-1) % 2 == 1
+
+
+def clearance(at: np.ndarray, outward: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    """How far `(r,)` the body is away from points `at` of its surface, seen along the normals; infinite if it is not.
+
+    Solves `at + t outward = start + s run` for each of the segments `pieces` `(e, 2, 2)`.
+    """
+    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    run, gap = pieces[:, 1] - pieces[:, 0], pieces[:, 0] - at[:, None]
+    turn = cross(outward[:, None], run)
+    faces = turn < 0  # it shows its outer side, as those of the same surface do not
+    safe = np.where(faces, turn, 1)
+    t, s = cross(gap, run) / safe, cross(gap, outward[:, None]) / safe
+    small = 1e-6 * np.ptp(pieces[:, 0], axis=0).max()
+    return np.where(faces & (t > small) & (s >= 0) & (s <= 1), t, np.inf).min(axis=1)

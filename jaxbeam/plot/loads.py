@@ -61,10 +61,9 @@ class Outside:
         self.kept: list[Artist] = []
         self.rigid: list[Artist] = []
         self.place: Any = None
-        if len(acting.tied):
+        if len(acting.springs.nodes):
             self.springs = self._keep(LineCollection([], colors=SPRING, linewidths=0.9, joinstyle="round", zorder=3.5))
-            (self.bases,) = ax.plot([], [], linestyle="", marker="s", markersize=2.5, color=SPRING, zorder=3.5)
-            self.kept.append(self.bases)
+            self.grounds = self._keep(LineCollection([], colors=SPRING, linewidths=0.8, zorder=3.4))
 
     @property
     def artists(self) -> list[Artist]:
@@ -75,9 +74,9 @@ class Outside:
         """Draw a state that the `Acting` has seen."""
         acting, label = self.acting, ", ".join(self.acting.names)
         self._move_obstacles(state)
-        if len(acting.tied):
-            self.springs.set_segments(list(acting.zigzags(state)))
-            self.bases.set_data(*acting.bases.T)
+        if len(acting.springs.nodes):
+            self.springs.set_segments(list(acting.springs.zigzags(state.x)))
+            self.grounds.set_segments(list(acting.springs.grounds()))
         if acting.loaded and label:
             self.single = self.single or self._arrows(label, 1.4, HEAD)
             self.single.move(acting.arrows(state))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import central_difference
-from quadrilateral import QUADRILATERAL
+from quadrilateral import QUADRILATERAL, quadrilaterals
 
 import jaxbeam as jb
 from jaxbeam.mesh import elements
@@ -21,13 +21,6 @@ def _known():
     elements.ELEMENTS[QUADRILATERAL.nodes] = QUADRILATERAL
     yield
     del elements.ELEMENTS[QUADRILATERAL.nodes]
-
-
-def quadrilaterals(mesh):
-    """A mesh of six-node triangles, two in each cell, as one of quadrilaterals with the same nodes."""
-    lower, upper = np.asarray(mesh.elements)[::2].T, np.asarray(mesh.elements)[1::2].T
-    corners, between = [lower[0], lower[1], lower[2], upper[2]], [lower[3], lower[4], upper[4], upper[5]]
-    return jb.Mesh(np.asarray(mesh.nodes), np.stack([*corners, *between, lower[5]], axis=1))
 
 
 def curved(nx=4, ny=3, seed=0):

@@ -206,15 +206,3 @@ def test_bodies_side_by_side_have_one_scale(mesh):
     (_, axes), *_ = frames_of(plot.animate_beams(each))
     short, long = (np.linalg.norm(np.subtract(*arrows(ax)), axis=1) for ax in axes)
     np.testing.assert_allclose([short, long], [[ARROW * LENGTH / 4], [ARROW * LENGTH]], rtol=1e-12)
-
-
-def test_supported_nodes_are_marked_where_they_are_now():
-    scene = jb.tendon_beam(5, 3)
-    grip = jb.support(scene.mesh, scene.tip, y=1.0)
-    held = jb.command(jb.Scene(scene.mesh, (scene.terms[0], grip), scene.fixed, scene.tip), [0.5])
-    x = jb.check(jb.equilibrium(held)).x
-    lines = plot.beam(held, x).get_lines()
-    white = [line for line in lines if line.get_marker() == "s" and line.get_markerfacecolor() == "white"]
-    np.testing.assert_allclose(np.column_stack(white[0].get_data()), np.asarray(x)[scene.tip])
-    bare = [line for line in plot.beam(scene, x).get_lines() if line.get_markerfacecolor() == "white"]
-    assert not any(len(line.get_xdata()) for line in bare if line.get_marker() == "s")
