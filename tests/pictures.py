@@ -6,6 +6,7 @@ from matplotlib.collections import PolyCollection
 import jaxbeam as jb
 
 LENGTH, HEIGHT = 4.0, 1.0
+BOUNDS = ((-4.0, 4.0), (-4.0, 4.0))
 
 
 def beam_mesh():
@@ -16,6 +17,13 @@ def scene_of(mesh, *terms):
     left = jb.nodes_where(mesh, lambda x, y: x < -LENGTH / 2 + 1e-9)
     tip = jb.nodes_where(mesh, lambda x, y: x > LENGTH / 2 - 1e-9)
     return jb.Scene(mesh, (jb.solid(mesh, jb.lame(1.0, 0.3)), *terms), jb.clamped(mesh, left), tip)
+
+
+def moved(mesh, far=1.0):
+    """A bend of the body."""
+    nodes = np.asarray(mesh.nodes)
+    across = -0.05 * far * (nodes[:, 0] + 2) ** 2
+    return np.stack([nodes[:, 0] + 0.1 * far * (nodes[:, 0] + 2) * nodes[:, 1], nodes[:, 1] + across], axis=1)
 
 
 def at(mesh, x, y):

@@ -13,7 +13,7 @@ Whatever acts on a body from outside is drawn, in the state that the picture sho
 are arrows to one scale: the longest is a tenth of the body. Forces per length, such as traction and pressure, are rows
 of arrows outside the body, to a scale of their own. In an animation or a gallery the scales are those of all states. A
 rigid obstacle is grey, with a hatched rim; limits of axes hold it as far as it lies close to the body. Springs are
-zigzags that end outside the body.
+zigzags that end outside the body. Supports are walls, blocks that move, and triangles (see `jaxbeam.plot.supports`).
 """
 
 from jaxbeam.plot.animations import animate_beams as animate_beams

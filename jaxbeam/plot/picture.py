@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,12 +50,13 @@ class Panel:
 
 
 def add_colour_bar(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel], label: str, scale: Scale) -> None:
-    """One colour bar for all `panels`, to the right of `axes`."""
-    figure.colorbar(panels[0].body.coloured, ax=list(axes), label=label, extend=scale.extend, pad=0.02, aspect=25)
+    """One colour bar for all `panels`, below `axes`: beside flat ones there is no room for its label."""
+    look: dict[str, Any] = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.05, "extend": scale.extend}
+    figure.colorbar(panels[0].body.coloured, ax=list(axes), label=label, **look)
 
 
 class Picture:
-    """A beam drawn at `x`. `move` draws it in another state, in about a millisecond.
+    """A beam drawn at `x`. `move` draws it in another state, in a few milliseconds.
 
     It shows the mesh, tendons, guides and anchors, the clamp, what acts on the body, the outline at rest, and a field
     in colour if one is given. For an animation of your own make one picture and move it in each frame:
@@ -97,6 +100,7 @@ class Picture:
         self._panel.show(state, doing, self.values)
         if field and scale:
             self._panel.add_colour_bar(field.label, scale)
+            self.field = dataclasses.replace(field, at_nodes=scale.at_nodes)  # it cannot show values of the other place
         if figure:
             add_legend(figure, [acting], [doing])
             fit_height(figure, axes)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbeam.core.tree import Numbers
 from jaxbeam.plot.fields import Field
-from jaxbeam.scene.scene import Scene, command, command_count
+from jaxbeam.scene.scene import Scene, command, command_count, commanded_terms
 
 
 class States:
@@ -52,6 +52,17 @@ class States:
         return [None] * len(self) if field is None else self.measure(field.function())
 
     @property
+    def varied(self) -> int:
+        """Number of the command that varies most; the first one if several vary alike."""
+        return int(np.argmax(np.ptp(self.commands, axis=0).round(6)))
+
+    @property
     def actuation(self) -> np.ndarray:
-        """`(s,)` ratio of the tendon whose command varies most; the first one if several vary alike."""
-        return self.commands[:, np.argmax(np.ptp(self.commands, axis=0).round(6))]
+        """`(s,)` the command that varies most, such as the ratio of a tendon."""
+        return self.commands[:, self.varied]
+
+    @property
+    def by_ratio(self) -> bool:
+        """Whether that command is a ratio."""
+        each = [term.kind.command_unit == 1 for term in commanded_terms(self.scene) for _ in range(term.command_count)]
+        return each[self.varied]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,6 +37,9 @@ from jaxbeam.scene.measures import tip_angle
 from jaxbeam.scene.scene import Scene
 from jaxbeam.study.branch import Branch
 
+# Number of characters of titles side by side.
+CHARACTERS = 72
+
 
 def curves(
     states: Sequence[States],
@@ -44,7 +48,7 @@ def curves(
     *,
     ax: Axes | None = None,
 ) -> Axes:
-    """A measure against actuation: the ratio of the tendon whose command varies most, falling to the right.
+    """A measure against the command that varies most, such as the ratio of a tendon, which falls to the right.
 
     Args:
         states: ramps or sweeps; every state is marked, and each ramp or sweep has a marker of its own.
@@ -73,7 +77,7 @@ def curves(
                 linewidth=1.2,
                 label=", ".join(filter(None, names)),
             )
-    _name_actuation_axes(ax, label)
+    _name_actuation_axes(ax, label, all(each.by_ratio for each in states))
     if len(ax.lines) > 1:
         ax.legend(frameon=False, fontsize="small")
     return ax
@@ -105,7 +109,7 @@ def branches(
         raise ValueError("traced: expected at least one Branch, got none")
     if ax is None:
         ax = Figure(figsize=(0.62 * PAPER, 0.42 * PAPER), layout="constrained").add_subplot()
-    shown = {}
+    shown, by_ratio = {}, []
     for number, branch in enumerate(traced):
         colour, critical = PALETTE[number % len(PALETTE)], branch.critical
         # Each critical point goes between its neighbours and counts as stable: the line changes its style there.
@@ -114,6 +118,7 @@ def branches(
         x = np.concatenate([branch.x, *(np.asarray(each.x)[None] for each in critical)])
         states = States(scene, commands, x)
         along, values = states.actuation, states.measure(measure)
+        by_ratio.append(states.by_ratio)
         negative = np.append(branch.negative, np.zeros(len(critical), int))[order]
         stable = np.maximum(negative[:-1], negative[1:]) == 0
         for run in np.split(np.arange(stable.size), np.flatnonzero(np.diff(stable)) + 1):
@@ -129,7 +134,7 @@ def branches(
             look |= {"marker": "D"} if each.kind == "bifurcation" else {"marker": "o", "markerfacecolor": "white"}
             ax.plot(along[place], values[place], **look)
             shown[each.kind] = Line2D([], [], label=each.kind, **look)
-    _name_actuation_axes(ax, label)
+    _name_actuation_axes(ax, label, all(by_ratio))
     ax.legend(handles=list(shown.values()), frameon=False, fontsize="small")
     return ax
 
@@ -149,7 +154,9 @@ def gallery(
         ValueError: if the titles are not one for each state, `columns` is less than 1, or the field is not one of a
             function or has values that cannot be drawn.
     """
-    titles = [command_title(states.scene, row) for row in states.commands] if titles is None else titles
+    if titles is None:
+        wide = int(CHARACTERS / min(max(columns, 1), len(states)))
+        titles = [textwrap.fill(command_title(states.scene, row), wide) for row in states.commands]
     if len(titles) != len(states):
         raise ValueError(f"titles: expected {len(states)}, one for each state, got {len(titles)}")
     if columns < 1:
@@ -179,10 +186,10 @@ def gallery(
     return figure
 
 
-def _name_actuation_axes(ax: Axes, label: str) -> None:
-    """Label the axes of a measure against actuation, which grows to the right as the ratio falls."""
-    ax.set(xlabel="commanded ratio (dimensionless)", ylabel=label)
-    if not ax.xaxis_inverted():
+def _name_actuation_axes(ax: Axes, label: str, by_ratio: bool) -> None:
+    """Label the axes of a measure against a command. Ratios fall to the right, so that actuation grows."""
+    ax.set(xlabel="commanded ratio (dimensionless)" if by_ratio else "command (its unit)", ylabel=label)
+    if by_ratio and not ax.xaxis_inverted():
         ax.invert_xaxis()
     ax.grid(color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from pictures import arrows, at, beam_mesh, frames_of, inside, legend, scene_of, upper
 
 import jaxbeam as jb
@@ -146,6 +147,36 @@ def test_a_spring_at_a_corner_lies_along_the_motion(mesh):
     x[corner] += [0.0, -0.3]
     base = zigzags(plot.beam(scene, x))[0][0]
     assert abs(base[0] - 2.0) < 0.01 and base[1] < -0.9
+
+
+@pytest.mark.parametrize("turn", [2.2, -2.2])
+def test_springs_do_not_run_through_a_body_that_has_turned(mesh, turn):
+    """About the end that they hold: off the surface as it was they would cross it. Nor do they when it is back."""
+    end = jb.nodes_where(mesh, lambda x, y: x > 2 - 1e-9)
+    terms = jb.solid(mesh, jb.lame(1.0, 0.3)), jb.penalty_springs(mesh, end, 1.0)
+    scene = jb.Scene(mesh, terms, np.zeros(mesh.nodes.shape, bool))
+    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    x = (np.asarray(mesh.nodes) - [2.0, 0.0]) @ rotation + np.array([2.0, 0.0])
+    picture = plot.Picture(scene)
+    corners = [at(mesh, *corner) for corner in [(-2.0, -0.5), (2.0, -0.5), (2.0, 0.5), (-2.0, 0.5)]]
+    for state in (x, np.asarray(mesh.nodes)):
+        picture.move(state)
+        body = Path(state[corners])
+        for line, node in zip(zigzags(picture.ax), end, strict=True):
+            np.testing.assert_allclose(line[-1], state[node], atol=1e-12)
+            assert not body.contains_points(line[0] + np.linspace(0, 0.97, 50)[:, None] * (line[-1] - line[0])).any()
+    assert inside(zigzags(plot.beam(scene, x)), plot.beam(scene, x))
+
+
+def test_springs_stand_on_ground_with_hatching(mesh):
+    lone = at(mesh, 1.0, -0.5)
+    ax = plot.beam(scene_of(mesh, jb.penalty_springs(mesh, [lone], 1.0)), mesh.nodes)
+    (grounds,) = (c.get_segments() for c in ax.collections if c.get_zorder() == 3.4)
+    base = zigzags(ax)[0][0]
+    bar, *strokes = grounds
+    np.testing.assert_allclose(bar.mean(axis=0), base, atol=1e-12)
+    np.testing.assert_allclose(bar[:, 1], base[1], atol=1e-12)
+    assert len(strokes) == 4 and all(stroke[1, 1] < stroke[0, 1] for stroke in strokes)
 
 
 def test_a_slack_cable_is_thinner_and_named(mesh):

@@ -4,6 +4,7 @@ Looks are judged by eye; what is tested is what a glance can miss: limits, shape
 """
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 import warnings
@@ -156,6 +157,29 @@ def test_curve_is_the_measure_against_the_ratio_that_varies_most(scene, states):
     np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-12)
     np.testing.assert_allclose(line.get_xdata(), states.commands[:, 0], rtol=1e-12)
     assert ax.xaxis_inverted() and ax.get_ylabel() == "tip angle (degrees)" and "dimensionless" in ax.get_xlabel()
+
+
+def test_a_curve_against_another_command_than_a_ratio_says_so_and_rises_to_the_right(scene, states):
+    tip = jb.dead_load(scene.mesh, scene.tip, [0.0, 0.0])
+    grip = jb.support(scene.mesh, scene.tip, y=1.0)
+    held = jb.Scene(scene.mesh, (*scene.terms, tip, grip), scene.fixed, scene.tip)
+    moved = plot.States(held, np.linspace([1.0, 1.0, 0.0], [0.9, 1.0, 0.5], STEPS), states.x)
+    ax = plot.curves([moved])
+    assert not ax.xaxis_inverted() and ax.get_xlabel() == "command (its unit)"
+    np.testing.assert_allclose(ax.lines[0].get_xdata(), np.linspace(0, 0.5, STEPS), atol=1e-12)
+    pulled = plot.States(held, np.linspace([1.0, 1.0, 0.0], [0.4, 1.0, 0.5], STEPS), states.x)
+    ax = plot.curves([pulled])
+    assert ax.xaxis_inverted() and ax.get_xlabel() == "commanded ratio (dimensionless)"
+
+
+def test_titles_of_a_gallery_do_not_run_into_each_other(scene, states):
+    grips = [jb.support(scene.mesh, [node], y=1.0) for node in scene.tip]
+    held = jb.Scene(scene.mesh, (*scene.terms, *grips), scene.fixed, scene.tip)
+    figure = plot.gallery(plot.States(held, np.full((3, 5), 0.77), states.x[:3]))
+    figure.draw_without_rendering()
+    extents = [ax.title.get_window_extent() for ax in figure.axes]
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(extents))
+    assert figure.axes[0].get_title().split() == ["commands", "0.77,", "0.77,", "0.77,", "0.77,", "0.77"]
 
 
 def test_curves_of_tensions_are_those_of_each_command(scene, states):
