@@ -24,9 +24,9 @@ PATTERNS = {"top pulled": (0.4, 1.0), "bottom pulled": (1.0, 0.4), "both pulled"
 
 
 def draw_fields(ramp: plot.States) -> Figure:
-    """Stress, volume ratio and energy at the end of a ramp."""
-    scene, x = ramp.scene, jnp.asarray(ramp.x[-1])
-    stress = jb.cauchy_stress(scene, x)
+    """Stress and volume ratio at the nodes, at the end of a ramp."""
+    scene, x = jb.command(ramp.scene, ramp.commands[-1]), jnp.asarray(ramp.x[-1])
+    stress, volume = jb.nodal_stress(scene, x), jb.to_nodes(scene, jb.jacobians(scene, x))
     bounds = plot.limits(scene.mesh.nodes, x)
     (x0, x1), (y0, y1) = bounds
     figure = Figure(figsize=(8.2, 4.5 * (y1 - y0) / (x1 - x0) + 1.6), layout="compressed")
@@ -34,8 +34,8 @@ def draw_fields(ramp: plot.States) -> Figure:
     fields = [
         ("Cauchy stress along x", stress[:, 0, 0], r"$\sigma_{xx}$ (unit of $E$)", None),
         ("Cauchy stress, shear", stress[:, 0, 1], r"$\sigma_{xy}$ (unit of $E$)", None),
-        ("volume ratio", jb.jacobians(scene, x), "$J$ (dimensionless)", 1.0),
-        ("strain energy of each element", jb.strain_energy(scene, x), r"force $\times$ length units", None),
+        ("von Mises stress", jb.nodal_von_mises_stress(scene, x), r"$\sigma_\mathrm{M}$ (unit of $E$)", None),
+        ("volume ratio", volume, "$J$ (dimensionless)", 1.0),
     ]
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, (title, values, label, centre) in zip(axes.ravel(), fields, strict=True):

@@ -98,14 +98,16 @@ def animate(scene: jb.Scene, path: jb.Design, targets: np.ndarray, region: np.nd
     bounds = plot.limits(scene.mesh.nodes, states, region, margin=0.03)
     figure = Figure(figsize=(4.0, 4.7), layout="compressed")
     ax = figure.add_subplot()
+    draw_crescent(ax, region)
+    picture = plot.Picture(scene, states[0], ax=ax, bounds=bounds)
+    ax.plot(*targets[[*range(POINTS), 0]].T, color="0.45", linewidth=0.8, zorder=7)
+    (way,) = ax.plot([], [], color=TRACE, linewidth=2.0, zorder=8)
+    (tip,) = ax.plot([], [], "o", color=TRACE, markeredgecolor="white", markersize=6, zorder=9)
 
     def draw(frame: int) -> None:
-        ax.clear()
-        draw_crescent(ax, region)
-        plot.beam(jb.command(scene, path.theta[frame % POINTS]), states[frame % POINTS], ax=ax, bounds=bounds)
-        ax.plot(*targets[[*range(POINTS), 0]].T, color="0.45", linewidth=0.8, zorder=7)
-        ax.plot(*tips[np.arange(frame + 1) % POINTS].T, color=TRACE, linewidth=2.0, zorder=8)
-        ax.plot(*tips[frame % POINTS], "o", color=TRACE, markeredgecolor="white", markersize=6, zorder=9)
+        picture.move(states[frame % POINTS], path.theta[frame % POINTS])
+        way.set_data(*tips[np.arange(frame + 1) % POINTS].T)
+        tip.set_data(*tips[[frame % POINTS]].T)
         ax.set_title("ratios " + ", ".join(f"{r:.2f}" for r in path.theta[frame % POINTS]), fontsize="medium")
 
     # Laid out once, not for every frame.

@@ -13,7 +13,7 @@ commands at the top and at the bottom are not. Those of the bottom take more eff
 """
 
 import argparse
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -60,15 +60,21 @@ def figure_of_eight() -> np.ndarray:
     return np.stack([5.0 - 0.14 * y**2 - 0.25 * np.sin(2 * s), y], axis=1)
 
 
-def draw(ax: Axes, scene: jb.Scene, path: jb.Design, targets: np.ndarray, k: int) -> None:
-    """The tentacle at point `k`, the figure, and the way of the tip up to there."""
+def draw(ax: Axes, scene: jb.Scene, path: jb.Design, targets: np.ndarray) -> Callable[[int], None]:
+    """The tentacle and the figure. The function returned moves it to point `k`, and draws the way of the tip."""
     tips, bounds = np.asarray(path.value), plot.limits(scene.mesh.nodes, path.solution.x, margin=0.04)
-    ax.clear()
-    ax.set_title(f"{100 * k / POINTS:.0f} % of the way", fontsize="medium")
-    plot.beam(jb.command(scene, path.theta[k % POINTS]), path.solution.x[k % POINTS], ax=ax, bounds=bounds)
+    picture = plot.Picture(scene, ax=ax, bounds=bounds)
     ax.plot(*targets[[*range(POINTS), 0]].T, color="0.55", linewidth=0.9, zorder=7, label="figure")
-    ax.plot(*tips[np.arange(k + 1) % POINTS].T, color="black", linewidth=1.8, zorder=8, label="way of the tip")
-    ax.plot(*tips[k % POINTS], "o", color="black", markeredgecolor="white", markersize=6, zorder=9)
+    (way,) = ax.plot([], [], color="black", linewidth=1.8, zorder=8, label="way of the tip")
+    (tip,) = ax.plot([], [], "o", color="black", markeredgecolor="white", markersize=6, zorder=9)
+
+    def to_point(k: int) -> None:
+        ax.set_title(f"{100 * k / POINTS:.0f} % of the way", fontsize="medium")
+        picture.move(path.solution.x[k % POINTS], path.theta[k % POINTS])
+        way.set_data(*tips[np.arange(k + 1) % POINTS].T)
+        tip.set_data(*tips[[k % POINTS]].T)
+
+    return to_point
 
 
 def main(out: Path) -> dict[str, float]:
@@ -96,7 +102,7 @@ def main(out: Path) -> dict[str, float]:
     figure = Figure(figsize=(9.0, 5.4), layout="constrained")
     *panels, last = figure.subplots(2, 3).flat
     for ax, k in zip(panels, DRAWN, strict=True):
-        draw(ax, scene, path, targets, k)
+        draw(ax, scene, path, targets)(k)
         ax.set_ylabel(ax.get_ylabel() if ax in (panels[0], panels[3]) else "")
     lines = last.plot(100 * np.arange(POINTS + 1) / POINTS, ratios[[*range(POINTS), 0]], linewidth=1.6)
     for line, colour, name in zip(lines, plot.PALETTE, ENDS, strict=True):
@@ -109,7 +115,11 @@ def main(out: Path) -> dict[str, float]:
     figure.savefig(out / "tentacle.png", dpi=200)
 
     moving = Figure(figsize=(5.0, 4.4), layout="constrained")
-    frame = partial(draw, moving.add_subplot(), scene, path, targets)
+    frame = draw(moving.add_subplot(), scene, path, targets)
+    # Laid out once, not for every frame.
+    frame(0)
+    moving.draw_without_rendering()
+    moving.set_layout_engine("none")
     plot.save_animation(FuncAnimation(moving, frame, frames=POINTS + 1), out / "tentacle.gif", fps=10)
     print(f"pictures are in {out}")
     return {"lowest ratio": float(ratios.min()), "top": float(above), "bottom": float(below)}

@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 import jaxbeam as jb
 from jaxbeam import plot
@@ -29,6 +30,9 @@ DISK, RADIUS = np.array([0.0, -2.35]), 0.4
 FORCE = 20.0
 STIFFNESS, TRANSITION = 1e5, 1e-3  # of the contact
 FRAMES, LIFT = 14, 0.6
+# The outline of the ground, from which a pedestal rises to the disk.
+RIGHT = np.array([[0.13, 0.0], [0.13, -0.4], [1.5, -0.4], [1.5, -2.0]])
+GROUND = DISK - [0.0, RADIUS] + np.concatenate([RIGHT, RIGHT[::-1] * [-1, 1]])
 
 
 def gripper() -> jb.Scene:
@@ -54,23 +58,24 @@ def grip(scene: jb.Scene, x: jax.Array) -> jax.Array:
     return 0.5 * jnp.sum(jnp.abs(jb.contact_forces(scene, x)[:, 0]))
 
 
-def draw(scene: jb.Scene, x: jax.Array, ax: Axes, sunk: float = 0.0) -> None:
-    """The gripper, seen by itself: when it is lifted, the ground sinks by `sunk`."""
-    plot.beam(scene, x, ax=ax, bounds=((-1.5, 1.5), (-3.4, 0.2)))
-    top = DISK[1] - RADIUS - sunk
-    for side, low, high in ((0.13, top - 0.4, top), (1.5, top - 2.0, top - 0.4)):  # a pedestal, and the ground
-        ax.fill_between([-side, side], low, high, facecolor="#F0E6D2", edgecolor="0.4", linewidth=0.8, zorder=0)
+def draw(scene: jb.Scene, x: jax.Array, ax: Axes) -> tuple[plot.Picture, Polygon]:
+    """The gripper, and a pedestal on the ground below the disk."""
+    ground = Polygon(GROUND, facecolor="#F0E6D2", edgecolor="0.4", linewidth=0.8, zorder=0)
+    ax.add_patch(ground)
+    return plot.Picture(scene, x, ax=ax, bounds=((-1.5, 1.5), (-3.4, 0.2))), ground
 
 
 def animate(scene: jb.Scene, path: jb.Solution) -> FuncAnimation:
     """The fingers close, and the disk is lifted off the ground."""
     figure = Figure(figsize=(3.6, 4.4), layout="constrained")
     ax = figure.add_subplot()
+    picture, ground = draw(scene, path.x[0], ax)
 
     def frame(k: int) -> None:
-        ax.clear()
         closed = min(k, len(path.x) - 1)
-        draw(jb.command(scene, path.ratios[closed]), path.x[closed], ax, LIFT * max(0, k - closed) / FRAMES)
+        picture.move(path.x[closed], path.ratios[closed])
+        # Seen by the gripper: when it is lifted, the ground sinks.
+        ground.set_xy(GROUND - [0.0, LIFT * (k - closed) / FRAMES])
 
     # Laid out once, not for every frame.
     frame(0)

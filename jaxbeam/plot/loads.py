@@ -99,7 +99,7 @@ class Outside:
         return made
 
     def _move_obstacles(self, state: Acted) -> None:
-        """Draw the obstacles anew if they, or the limits of the axes, have changed: that takes about ten milliseconds."""
+        """Draw the obstacles anew if they, or the limits of the axes, have changed: that takes ten milliseconds."""
         params = [state.scene.terms[k].params for k in self.acting.rigid]
         place = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)], self.ax.viewLim.bounds
         if place == self.place or not self.acting.rigid:
