@@ -23,7 +23,9 @@ def main() -> None:
     try:
         plot.interact(tendon_beam(), bounds=tuple(arguments.bounds))
     except ValueError as error:
-        parser.error(str(error))
+        parser.error(f"{error}; here: --browser" if not arguments.browser else str(error))
+    except ImportError:
+        parser.error("--browser needs tornado: pip install tornado")
 
 
 if __name__ == "__main__":

@@ -243,7 +243,10 @@ def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
     shape = "(m,)" if ndim == 1 else "(m, k)"
     array = plain(name, value, f"whole numbers of shape {shape}")
     if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
-        raise ValueError(f"{name}: expected whole numbers of shape {shape}, got shape {array.shape} of {array.dtype}")
+        got = "none" if array.size == 0 else f"shape {array.shape} of {array.dtype}"
+        points = array.dtype.kind == "f" and array.ndim == ndim + 1 and array.shape[-1] == 2
+        cure = "; choose nodes by points with nearest_node(mesh, points)" if points else ""
+        raise ValueError(f"{name}: expected whole numbers of shape {shape}, got {got}{cure}")
     outside = array[(array < 0) | (array >= total)]
     if outside.size:
         raise ValueError(f"{name}: {outside[0]} is out of range, nodes are numbered 0 to {total - 1}")
@@ -278,6 +281,7 @@ def positions(name: str, value: Any, shape: Shape, dtype: Any) -> jax.Array:
         raise ValueError(f"{name}: expected {expected}, got dtype {array.dtype}; {_cure(array.dtype)}")
     if array.shape != shape:
         many = array.ndim == len(shape) + 1 and array.shape[1:] == shape
-        cure = f"; for many states use jax.vmap over {name}" if many else ""
+        cure = f"; give one state, {name}[-1], or all by jax.vmap(lambda {name}: measure(scene, {name}))({name})"
+        cure = cure if many else "; commands are set by command(scene, values)" * (array.ndim == 1)
         raise ValueError(f"{name}: expected {expected}, got {array.shape}{cure}")
     return array if isinstance(array, jax.Array) else to_device(array, dtype)

@@ -46,7 +46,10 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
 
     Args:
         young: Young's modulus, positive; scalar or `(t,)`, one for each element.
-        poisson: Poisson's ratio in (-1, 0.5); scalar or `(t,)`.
+        poisson: Poisson's ratio in (-1, 0.5); scalar or `(t,)`. Above 0.47 triangles of three nodes lock: use six.
+
+    The moduli are those that a pull at small strain shows with every density but `macklin_mueller`, the default of
+    `solid`, which needs `lame_macklin_mueller` for that.
 
     Returns:
         `mu = E / (2 (1 + nu))`, `lam = E nu / ((1 + nu)(1 - 2 nu))`, differentiable in both.
@@ -56,7 +59,8 @@ def lame(young: Numbers, poisson: Numbers) -> Lame:
             outside its range becomes NaN.
     """
     E = numbers("young", young, POSITIVE, why="a stiffness is positive")
-    nu = numbers("poisson", poisson, POISSON, why="0.5 is incompressible, where lam is infinite: use 0.4999, say")
+    incompressible = "0.5 is incompressible, where lam is infinite: use 0.49, and triangles of six nodes"
+    nu = numbers("poisson", poisson, POISSON, why=incompressible)
     if () not in (E.shape, nu.shape) and E.shape != nu.shape:
         raise ValueError(f"poisson: expected a scalar or the shape of young, {E.shape}, got {nu.shape}")
     xp, dtype = namespace(E, nu), jnp.result_type(float)

@@ -102,6 +102,10 @@ def solid(
 ) -> Term:
     """The elastic body.
 
+    The default density is that of the reference scene. With `lame(young, poisson)` it is softer at small strain than
+    they say, the more so the smaller Poisson's ratio is: for (1e4, 0.3) it shows 8974 and 0.167. For a body of your own
+    take `neo_hookean`, or `lame_macklin_mueller`.
+
     Args:
         mesh: mesh of triangles with nodes `(n, 2)`; differentiable in them.
         params: the density's parameters, such as `lame(young, poisson)`: a pytree whose leaves are scalars

@@ -1,7 +1,34 @@
 """Pictures and animations of beams. Only this folder needs matplotlib, so it must be imported by name.
 
-Every function draws into the `ax` it is given or into a new `Figure`, and leaves pyplot, its backend and `rcParams`
-alone, so that it works without a display. Save a still with `ax.figure.savefig(path)` and an animation with
+    path = jb.ramp(scene, [0.5, 1.0])
+    states = plot.States(scene, path.ratios, path.x)
+    plot.save_animation(plot.animate_ramp(states, field=jb.nodal_von_mises_stress), "ramp.gif")
+
+One state
+  Picture         a beam with all that holds it and acts on it, which can be moved
+  Field           what to show in colour: a measure, its label and its colours
+  beam, field     the axes of a picture, without and with a field
+
+Many states
+  States          the states of a ramp or a sweep, to be drawn
+  gallery         a panel for each
+  animate_ramp    a beam in motion beside the curve that it traces
+  animate_beams   several beams in motion, side by side
+  save_animation  as .gif or .mp4
+  curves          a measure against actuation
+  branches        what `trace_branch` found
+
+To play
+  interact        a window with sliders, in which the tip can be dragged
+  Window          that window, on a figure of your own
+
+To draw into axes of your own
+  limits, Limits  axis limits that hold several states
+  PALETTE         colours of tendons and curves
+  MARKERS         markers of curves
+
+All but `interact` draw into the `ax` they are given or into a new `Figure`, and leave pyplot, its backend and
+`rcParams` alone, so that they work without a display. Save a still with `ax.figure.savefig(path)` and an animation with
 `save_animation`. Lengths, forces and stresses are in the user's units.
 
 A tendon that pulls is drawn solid, one that pushes dashed, and a slack cable thin and pale. The patch of surface that

@@ -25,7 +25,7 @@ from jaxbeam.plot.drawing import (
     panels,
     prepare,
 )
-from jaxbeam.plot.fields import Field, Scale, scales_of
+from jaxbeam.plot.fields import Field, Function, Scale, field_of, scales_of
 from jaxbeam.plot.lines import extremes
 from jaxbeam.plot.picture import Panel, add_colour_bar
 from jaxbeam.plot.states import States
@@ -45,7 +45,7 @@ def animate_ramp(
     measure: Callable[[Scene, jax.Array], jax.Array] = tip_angle,
     label: str = "tip angle (degrees)",
     *,
-    field: Field | None = None,
+    field: Field | Function | None = None,
 ) -> FuncAnimation:
     """A beam in motion, and beside it the curve that it traces.
 
@@ -53,7 +53,7 @@ def animate_ramp(
         states: the states to show in order, such as a ramp.
         measure: as in `curves`.
         label: text of the curve's vertical axis: quantity and unit.
-        field: what to show in colour: a `Field` of a function.
+        field: what to show in colour: a function `(scene, x)`, or a `Field` of one.
     """
     figure = Figure(figsize=(PAPER, 0.5 * PAPER), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -76,12 +76,12 @@ def animate_ramp(
     return _play(figure, [left], [states], [acting], [seen], field, trace)
 
 
-def animate_beams(states: Sequence[States], *, field: Field | None = None) -> FuncAnimation:
+def animate_beams(states: Sequence[States], *, field: Field | Function | None = None) -> FuncAnimation:
     """Several beams side by side, to one scale and in step.
 
     Args:
         states: one for each panel, all with the same number of states.
-        field: what to show in colour: a `Field` of a function. All panels have one colour scale.
+        field: what to show in colour: a function `(scene, x)`, or a `Field` of one. All panels have one colour scale.
 
     Raises:
         ValueError: if `states` is empty, the numbers of states differ, or the field is not one of a function or has
@@ -131,13 +131,14 @@ def _play(
     states: Sequence[States],
     acting: Sequence[Acting],
     seen: Sequence[Sequence[Acted]],
-    field: Field | None,
+    field: Field | Function | None,
     trace: Callable[[int], None] = lambda frame: None,
 ) -> FuncAnimation:
     """Animate each of `states`, and what acts on it, on its axes.
 
     `trace(frame)` draws whatever else changes from frame to frame.
     """
+    field = field_of(field)
     doing, values = [each.measure(doing_of) for each in states], [each.values(field) for each in states]
     drawn = zip((each.scene for each in states), values, strict=True)
     scales: Sequence[Scale | None] = scales_of(field, list(drawn)) if field else [None] * len(states)

@@ -20,6 +20,8 @@ from jaxbeam.mesh.elements import element_of
 from jaxbeam.plot.lines import elements_of
 from jaxbeam.scene.scene import Scene
 
+Function = Callable[[Scene, jax.Array], jax.Array]
+
 # Straight pieces of each curved edge of an element whose colours are smooth.
 PIECES = 4
 
@@ -66,6 +68,19 @@ class Field:
                 "of a single state"
             )
         return self.values
+
+
+def field_of(field: Field | Function | None) -> Field | None:
+    """A field; of a bare function the field with its name as label.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    if field is None or isinstance(field, Field):
+        return field
+    if callable(field):
+        return Field(field, getattr(field, "__name__", "field").replace("_", " "))
+    raise ValueError(f"field: expected a function (scene, x), or a Field with a label, got {type(field).__name__}")
 
 
 class Scale(NamedTuple):

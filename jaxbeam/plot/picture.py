@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.artist import Artist
@@ -26,7 +25,7 @@ from jaxbeam.plot.drawing import (
     positions_of,
     prepare,
 )
-from jaxbeam.plot.fields import Field, Scale, scales_of
+from jaxbeam.plot.fields import Field, Function, Scale, field_of, scales_of
 from jaxbeam.plot.lines import extremes
 from jaxbeam.plot.loads import Outside
 from jaxbeam.scene.scene import Scene, command
@@ -67,7 +66,8 @@ class Picture:
     Args:
         scene: under the commands of this state, which decide which tendons push and where obstacles are.
         x: `(n, d)` node positions; by default those at rest.
-        field: what to show in colour. Its colour scale is that of this state; `Field(colours=...)` sets another one.
+        field: what to show in colour: a `Field`, or a function `(scene, x)`. Its colour scale is that of this state;
+            `Field(colours=...)` sets another one.
         ax: where to draw (`ax.legend()` names what is there); by default a new figure with a legend.
         bounds: axis limits, by default those that hold the beam here and at rest, and what acts on it.
 
@@ -82,10 +82,11 @@ class Picture:
         scene: Scene,
         x: Numbers | None = None,
         *,
-        field: Field | None = None,
+        field: Field | Function | None = None,
         ax: Axes | None = None,
         bounds: Limits | None = None,
     ) -> None:
+        field = field_of(field)
         positions = positions_of(scene, scene.mesh.nodes if x is None else x)
         acting = Acting(scene)
         state = acting.see(scene, positions)
@@ -164,7 +165,7 @@ def beam(scene: Scene, x: Numbers, *, ax: Axes | None = None, bounds: Limits | N
 def field(
     scene: Scene,
     x: Numbers,
-    values: Numbers | Callable[[Scene, jax.Array], jax.Array],
+    values: Numbers | Function,
     label: str,
     *,
     centre: float | None = None,

@@ -29,7 +29,7 @@ from jaxbeam.plot.drawing import (
     limits,
     panels,
 )
-from jaxbeam.plot.fields import Field, scales_of
+from jaxbeam.plot.fields import Field, Function, field_of, scales_of
 from jaxbeam.plot.lines import extremes
 from jaxbeam.plot.picture import Panel, add_colour_bar
 from jaxbeam.plot.states import States
@@ -140,7 +140,7 @@ def branches(
 
 
 def gallery(
-    states: States, titles: Sequence[str] | None = None, columns: int = 3, *, field: Field | None = None
+    states: States, titles: Sequence[str] | None = None, columns: int = 3, *, field: Field | Function | None = None
 ) -> Figure:
     """A panel for each state, all to one scale.
 
@@ -148,7 +148,7 @@ def gallery(
         states: the states to show, such as a sweep over asymmetric commands.
         titles: one for each state; by default its ratios.
         columns: number of panels in a row.
-        field: what to show in colour: a `Field` of a function. All panels have one colour scale.
+        field: what to show in colour: a function `(scene, x)`, or a `Field` of one. All panels have one colour scale.
 
     Raises:
         ValueError: if the titles are not one for each state, `columns` is less than 1, or the field is not one of a
@@ -173,6 +173,7 @@ def gallery(
         axes[k].remove()
         axes[k - columns].tick_params(labelbottom=True)
         axes[k - columns].set_xlabel("x (length units)")
+    field = field_of(field)
     doing, values = states.measure(doing_of), states.values(field)
     (scale,) = scales_of(field, [(states.scene, values)]) if field else (None,)
     beams = [Panel(ax, acting, scale) for ax in axes[: len(states)]]

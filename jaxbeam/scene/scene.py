@@ -75,6 +75,8 @@ class Scene:
                 f"fixed: expected booleans of shape {shape}, got shape {fixed.shape} of dtype {fixed.dtype}; "
                 f"make them with clamped(mesh, nodes)"
             )
+        if isinstance(self.terms, list):
+            object.__setattr__(self, "terms", tuple(self.terms))
         if not isinstance(self.terms, tuple) or not self.terms or not all(isinstance(t, Term) for t in self.terms):
             raise ValueError(f"terms: expected a tuple of at least one Term, got {self.terms!r}")
         for number, term in enumerate(self.terms):

@@ -76,5 +76,10 @@ class Design:
             return f"Design({len(flags)} targets: {words}; {int(np.sum(self.solves))} solves)"
         count = sum(leaf.size for leaf in jax.tree.leaves(self.theta))
         theta = jax.tree.map(lambda leaf: leaf.tolist(), self.theta) if count <= 8 else f"of {count} numbers"
-        status = DesignStatus(int(self.status)).name
-        return f"Design({status}; value {self.value.tolist()}, theta {theta}, {int(self.solves)} solves)"
+        status = DesignStatus(int(self.status))
+        parts = [f"value {self.value.tolist()}", f"theta {theta}", f"{int(self.solves)} solves"]
+        if status != DesignStatus.REACHED:
+            parts.append(f"distance from the target {float(self.loss):.4g}")
+        if self.held.any() and self.held.size <= 8:
+            parts.append(f"held {self.held.tolist()}")
+        return f"Design({status.name}; {', '.join(parts)})"

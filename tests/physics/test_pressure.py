@@ -97,7 +97,7 @@ def test_thick_ring(order, error):
 def test_one_command_for_all_edges():
     """Ramped like a tendon."""
     scene = arch()
-    assert "commands [0.]" in repr(scene)
+    assert "commands [0]" in repr(scene)
     sag = lambda scene, x: jb.tip_position(scene, x)[1]
     path = jb.check(jb.ramp(scene, [20.0], 5))
     np.testing.assert_allclose(path.ratios[:, 0], np.linspace(0, 20, 5))

@@ -168,7 +168,7 @@ def test_command_refuses(small, ratios, message):
         ({"fixed": np.zeros(6, bool)}, r"fixed: expected booleans of shape \(6, 2\), got shape \(6,\)"),
         ({"fixed": np.ones((6, 2), bool)}, r"fixed: every coordinate is fixed, nothing is left to solve for"),
         ({"terms": ()}, r"terms: expected a tuple of at least one Term, got \(\)"),
-        ({"terms": [BODY]}, r"terms: expected a tuple of at least one Term, got \["),
+        ({"terms": [BODY, 1]}, r"terms: expected a tuple of at least one Term, got \("),
         ({"terms": (BODY, jb.energy)}, r"terms: expected a tuple of at least one Term"),
         ({"tip": [6]}, r"tip: 6 is out of range, nodes are numbered 0 to 5"),
         ({"tip": [[4]]}, r"tip: expected whole numbers of shape \(m,\), got shape \(1, 1\)"),
