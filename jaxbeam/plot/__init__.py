@@ -43,11 +43,11 @@ rigid obstacle is grey, with a hatched rim; limits of axes hold it as far as it 
 zigzags that end outside the body. Supports are walls, blocks that move, and triangles (see `jaxbeam.plot.supports`).
 """
 
+from jaxbeam.mesh.sketch import PALETTE as PALETTE
 from jaxbeam.plot.animations import animate_beams as animate_beams
 from jaxbeam.plot.animations import animate_ramp as animate_ramp
 from jaxbeam.plot.animations import save_animation as save_animation
 from jaxbeam.plot.drawing import MARKERS as MARKERS
-from jaxbeam.plot.drawing import PALETTE as PALETTE
 from jaxbeam.plot.drawing import Limits as Limits
 from jaxbeam.plot.drawing import limits as limits
 from jaxbeam.plot.fields import Field as Field

@@ -18,6 +18,7 @@ from matplotlib.patheffects import withStroke
 
 from jaxbeam.core.compiling import one_program
 from jaxbeam.core.tree import Numbers
+from jaxbeam.mesh.sketch import BODY, OUTLINE, PALETTE
 from jaxbeam.plot.acting import Acting
 from jaxbeam.plot.fields import Scale, Smooth
 from jaxbeam.plot.lines import (
@@ -38,11 +39,10 @@ from jaxbeam.scene.scene import Scene, commanded_terms, placed
 Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
 
-# Colours and markers of tendons and curves.
-PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Markers of curves.
 MARKERS = ("o", "s", "^", "D", "v", "P")
-# Colours of the body, the edges of its elements, its outline, and its outline at rest.
-BODY, MESH, OUTLINE, GHOST = "#DCE5EE", "#B4C2CF", "#33414E", "#9A9A9A"
+# Colours of the edges of elements, and of the outline at rest.
+MESH, GHOST = "#B4C2CF", "#9A9A9A"
 # Dashes of a tendon that pushes, and of the unstable part of a branch.
 PUSHING = (0, (2.2, 1.3))
 # What a tendon does beside pulling, numbered as `doing_of` has it, and how it looks then.

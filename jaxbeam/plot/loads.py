@@ -13,10 +13,11 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
+from jaxbeam.mesh.sketch import OUTLINE
 from jaxbeam.plot.acting import Acted, Acting, Distance
 
-# Colours of forces, of springs, and of an obstacle and its boundary.
-FORCE, SPRING, RIGID, RIM = "#111111", "#33414E", "#E6E6E6", "#7A7A7A"
+# Colours of forces, and of an obstacle and its boundary.
+FORCE, RIGID, RIM = "#111111", "#E6E6E6", "#7A7A7A"
 # Length of the head of an arrow and half its width, and depth of the hatching of an obstacle, relative to the body.
 HEAD, HALF, HATCHED = 0.026, 0.34, 0.025
 # Points of the grid on which an obstacle is found, along the longer side of the axes.
@@ -62,8 +63,8 @@ class Outside:
         self.rigid: list[Artist] = []
         self.place: Any = None
         if len(acting.springs.nodes):
-            self.springs = self._keep(LineCollection([], colors=SPRING, linewidths=0.9, joinstyle="round", zorder=3.5))
-            self.grounds = self._keep(LineCollection([], colors=SPRING, linewidths=0.8, zorder=3.4))
+            self.springs = self._keep(LineCollection([], colors=OUTLINE, linewidths=0.9, joinstyle="round", zorder=3.5))
+            self.grounds = self._keep(LineCollection([], colors=OUTLINE, linewidths=0.8, zorder=3.4))
 
     @property
     def artists(self) -> list[Artist]:

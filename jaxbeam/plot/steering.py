@@ -23,6 +23,8 @@ from jaxbeam.study.reach import command_bounds, reach
 
 # Largest distance of the tip from where it is dragged to, as a share of the body, and in units of round-off.
 FOLLOWS, ROUNDED = 1e-8, 100
+# Numbers in a line of facts.
+ROW = 4
 
 
 class Shown(NamedTuple):
@@ -151,7 +153,8 @@ class Steering:
 
 def _facts(scene: Scene, x: jax.Array) -> list[tuple[str, str]]:
     """What can be measured of this scene, in words and numbers."""
-    rows = lambda values: ", ".join(f"{float(value):.4g}" for value in np.ravel(values))
+    words = lambda values: [f"{float(value):.4g}" for value in np.ravel(values)]
+    rows = lambda values: ",\n".join(", ".join(words(values)[k : k + ROW]) for k in range(0, values.size, ROW))
     measures: list[tuple[str, Callable[..., Any], Callable[..., str]]] = [
         ("lengths", tendon_lengths, rows),
         ("tensions", tendon_tensions, rows),

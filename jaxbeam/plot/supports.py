@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 
+from jaxbeam.mesh.sketch import OUTLINE as INK
 from jaxbeam.plot.lines import edge_curves
 from jaxbeam.scene.scene import Scene
 
-INK = "#33414E"
 # Lengths relative to the body, within the margin of `limits`: depth of the hatching of a clamp and of a block, half the
 # height of the clamp of a rod, height of a triangle and half its base, gap between it and the ground of a roller, half
 # the width of the ground, its hatching, and least distance of triangles in a row.

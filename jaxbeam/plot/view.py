@@ -112,7 +112,7 @@ class View:
         if sliders:
             self.set_sliders(shown.commands)
         self._facts.set_text("\n".join(text for _, text in shown.facts))
-        names = "\n".join(name for name, _ in shown.facts)
+        names = "\n".join(name + "\n" * text.count("\n") for name, text in shown.facts)
         if names != self._names.get_text():
             self._names.set_text(names)
             self._background = None
@@ -203,7 +203,10 @@ class View:
     def on_draw(self, event: Any) -> None:
         """After all else was drawn: keep it as the background, and draw what moves on top."""
         canvas: Any = self.canvas
-        if isinstance(canvas, FigureCanvasAgg) and event.canvas is canvas and not canvas.is_saving():
+        if canvas.is_saving():  # then axes have drawn all that is theirs
+            self._facts.draw(event.renderer)
+            return
+        if isinstance(canvas, FigureCanvasAgg) and event.canvas is canvas:
             self._background = canvas.copy_from_bbox(self.figure.bbox)
         for artist in self._moving():
             artist.draw(event.renderer)

@@ -305,6 +305,10 @@ def test_the_axes_grow_with_the_body_and_a_saved_picture_shows_it(window, tmp_pa
     window.view.figure.savefig(tmp_path / "window.png", dpi=50)
     pixels = np.asarray(Image.open(tmp_path / "window.png").convert("RGB"), int)
     body = np.abs(pixels - [0xDC, 0xE5, 0xEE]).max(axis=2) < 12
+    window.view._facts.set_text("")
+    window.view.figure.savefig(tmp_path / "bare.png", dpi=50)
+    bare = np.asarray(Image.open(tmp_path / "bare.png").convert("RGB"), int)
+    assert (bare != pixels).any(axis=2).sum() > 50  # the facts are in the picture too
     assert body.sum() > 500
 
 
