@@ -243,7 +243,7 @@ def node_numbers(name: str, total: int, value: Any, ndim: int) -> np.ndarray:
     shape = "(m,)" if ndim == 1 else "(m, k)"
     array = plain(name, value, f"whole numbers of shape {shape}")
     if array.dtype.kind not in "iu" or array.ndim != ndim or array.size == 0:
-        got = "none" if array.size == 0 else f"shape {array.shape} of {array.dtype}"
+        got = f"shape {array.shape}" + (", which is empty" if array.size == 0 else f" of {array.dtype}")
         points = array.dtype.kind == "f" and array.ndim == ndim + 1 and array.shape[-1] == 2
         cure = "; choose nodes by points with nearest_node(mesh, points)" if points else ""
         raise ValueError(f"{name}: expected whole numbers of shape {shape}, got {got}{cure}")

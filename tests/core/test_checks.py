@@ -150,7 +150,10 @@ REFUSED = {
             jb.lowest_mode,
         )
     },
-    "many states": (lambda: jb.tip_angle(BEAM, jnp.stack([REST, REST])), r"got \(2, 15, 2\); .* use jax.vmap over x"),
+    "many states": (
+        lambda: jb.tip_angle(BEAM, jnp.stack([REST, REST])),
+        r"got \(2, 15, 2\); .*jax.vmap\(lambda x: measure\(",
+    ),
     "whole positions": (lambda: jb.energy(BEAM, jnp.zeros((15, 2), int)), "x: expected .*, got dtype int64; convert"),
     "solution for x": (
         lambda: jb.tip_angle(BEAM, SOLUTION),
