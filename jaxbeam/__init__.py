@@ -125,6 +125,11 @@ Design
   reach_each                the same for a sequence of targets, such as a path
   minimise                  any loss of any design: shape, material, commands
 
+Fit to measurements
+  fit                       parameters of a design by least squares, and what is known of them
+  predict                   a measure under new commands, with its standard error
+  next_experiment           which commands are best measured next
+
 Pictures and files, imported by themselves
   jaxbeam.plot              stills, curves, animations, and a window to play in
   jaxbeam.files             meshes in; results for ParaView and tables out; archives
@@ -138,6 +143,9 @@ Types of what comes back
   Branch                    of `trace_branch`
   Critical                  a fold or a bifurcation on a branch
   ErrorEstimate             of `estimate_error`
+  Fit                       of `fit`
+  Prediction                of `predict`
+  Experiments               of `next_experiment`
   Answer                    of `solve_to`
   TwoMeshes                 of `two_meshes`
   Corrected                 of `corrected`
@@ -257,6 +265,12 @@ from jaxbeam.study.design import Design as Design
 from jaxbeam.study.design import DesignStatus as DesignStatus
 from jaxbeam.study.design import History as History
 from jaxbeam.study.doubt import Doubt as Doubt
+from jaxbeam.study.experiments import Experiments as Experiments
+from jaxbeam.study.experiments import Prediction as Prediction
+from jaxbeam.study.experiments import next_experiment as next_experiment
+from jaxbeam.study.experiments import predict as predict
+from jaxbeam.study.fit import Fit as Fit
+from jaxbeam.study.fit import fit as fit
 from jaxbeam.study.minimise import minimise as minimise
 from jaxbeam.study.model_doubt import model_doubt as model_doubt
 from jaxbeam.study.reach import reach as reach

@@ -1,4 +1,4 @@
-"""Studies of equilibria: stability, branches, error estimates, inverse design.
+"""Studies of equilibria: stability, branches, error estimates, inverse design, fitting.
 
 Inverse design:
 
@@ -7,6 +7,13 @@ Inverse design:
 - `reach_each` for a sequence of targets, such as a path of the tip: each search starts from the answer before.
 - `minimise` for all else: unknown shapes, materials or loads, or a loss in place of a target. It has no bounds and
   takes more solves.
+
+Fitting:
+
+- `fit` where the parameters are unknown and equilibria were measured: moduli, Poisson's ratio, rest lengths. It says
+  which of them the data determine, with standard errors.
+- `predict` for any measure under a new command, with the error that it inherits from the parameters;
+  `next_experiment` for the commands that are best measured next.
 
 Errors:
 

@@ -1,0 +1,124 @@
+"""Least squares within bounds by the method of Levenberg and Marquardt, on the host.
+
+Each step minimises the linearised residuals with a penalty on its length, in units of the column norms of the Jacobian
+(Moré 1978, Lecture Notes in Mathematics 630, 105-116). Parameters at a bound that the gradient pushes against stay
+there, and a step that would pass a bound is cut to it (Kanzow, Yamashita and Fukushima 2004, J. Comput. Appl. Math.
+172, 375-397). A direction in which the residuals do not change is not moved along at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbeam.study.design import DesignStatus
+
+# First damping, by what it is divided after a good step and multiplied after a bad one, and its range.
+DAMPING, EASED, RAISED, LOWEST, HIGHEST = 1e-3, 8.0, 5.0, 1e-12, 1e12
+# Singular values below this share of the largest count as zero: derivatives are no more exact.
+BLIND = 1e-8
+# The search has converged if the next step is shorter than this in units of the scales of the parameters, or would
+# lower the sum of squares by less than this share of it.
+SHORT, FLAT = 1e-9, 1e-14
+# Share of the predicted fall of the sum of squares that a step must reach.
+WORTH = 1e-4
+
+
+class Residuals(NamedTuple):
+    """Residuals `(r,)`, their Jacobian `(r, q)`, and what else came with them."""
+
+    values: np.ndarray
+    jacobian: np.ndarray
+    other: Any
+
+    @property
+    def cost(self) -> float:
+        """The sum of squares."""
+        return float(self.values @ self.values)
+
+
+@dataclasses.dataclass
+class Search:
+    """Where a search ended.
+
+    theta: `(q,)` parameters.
+    here: the residuals there.
+    held: `(q,)` -1 or 1 where a lower or upper bound holds a parameter, else 0.
+    costs: sum of squares of each point that was accepted, the start first.
+    trials: number of points at which residuals were asked for.
+    status: `REACHED` at a minimum, else `NOT_CONVERGED`.
+    """
+
+    theta: np.ndarray
+    here: Residuals
+    held: np.ndarray
+    costs: list[float]
+    trials: int = 1
+    status: DesignStatus = DesignStatus.NOT_CONVERGED
+
+
+def least_squares(
+    residuals: Callable[[np.ndarray, Residuals | None], Residuals | None],
+    start: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    scales: np.ndarray,
+    max_steps: int,
+    report: Callable[[int, float], None],
+) -> Search:
+    """The parameters of least squares nearest to the start, downhill.
+
+    Args:
+        residuals: from parameters `(q,)`, and the residuals of the last accepted point, those there; None where they
+            do not exist.
+        start: `(q,)` parameters within the bounds, at which residuals exist.
+        low: lower bounds.
+        high: upper bounds.
+        scales: `(q,)` of the parameters.
+        max_steps: the most trials.
+        report: called after each trial with their number and the sum of squares.
+    """
+    first = residuals(start, None)
+    assert first is not None
+    state = Search(start, first, np.zeros(len(start), int), [first.cost])
+    damping, norms = DAMPING, np.zeros(len(start))
+    while True:
+        J, r = state.here.jacobian * scales, state.here.values
+        norms = np.maximum(norms, np.linalg.norm(J, axis=0))
+        slope = J.T @ r
+        state.held = np.where(
+            (state.theta <= low) & (slope > 0), -1, np.where((state.theta >= high) & (slope < 0), 1, 0)
+        )
+        free = state.held == 0
+        step = _step(J, r, norms, free, damping)
+        trial = np.clip(state.theta + scales * step, low, high)
+        step = (trial - state.theta) / scales
+        fall = state.here.cost - float(np.sum((r + J @ step) ** 2))
+        if np.abs(step).max() <= SHORT or fall <= FLAT * state.here.cost:
+            state.status = DesignStatus.REACHED
+            return state
+        if state.trials > max_steps or damping > HIGHEST:
+            return state
+        new = residuals(trial, state.here)
+        state.trials += 1
+        if new is not None and state.here.cost - new.cost >= WORTH * fall:
+            state.theta, state.here, damping = trial, new, max(damping / EASED, LOWEST)
+            state.costs.append(new.cost)
+        else:
+            damping *= RAISED
+        report(state.trials, state.here.cost)
+
+
+def _step(J: np.ndarray, r: np.ndarray, norms: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
+    """The step `(q,)` of the free parameters that minimises `|r + J step|^2 + damping |norms step|^2`."""
+    step, units = np.zeros(len(norms)), np.where(norms > 0, norms, 1)
+    if not free.any():
+        return step
+    u, sizes, v = np.linalg.svd(J[:, free] / units[free], full_matrices=False)
+    seen = sizes > BLIND * sizes.max(initial=0.0)
+    along = np.where(seen, sizes / np.where(seen, sizes**2 + damping, 1), 0)
+    step[free] = -(v.T @ (along * (u.T @ r))) / units[free]
+    return step
