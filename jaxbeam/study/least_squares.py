@@ -2,8 +2,9 @@
 
 Each step minimises the linearised residuals with a penalty on its length, in units of the column norms of the Jacobian
 (Moré 1978, Lecture Notes in Mathematics 630, 105-116). Parameters at a bound that the gradient pushes against stay
-there, and a step that would pass a bound is cut to it (Kanzow, Yamashita and Fukushima 2004, J. Comput. Appl. Math.
-172, 375-397). A direction in which the residuals do not change is not moved along at all.
+there. Those that a step would take past a bound go to the bound, and the step of the others is found anew with them
+there (active sets: Nocedal and Wright 2006, Numerical Optimization, ch. 16.5). A direction in which the residuals do
+not change is not moved along at all.
 """
 
 from __future__ import annotations
@@ -16,13 +17,16 @@ import numpy as np
 
 from jaxbeam.study.design import DesignStatus
 
-# First damping, by what it is divided after a good step and multiplied after a bad one, and its range.
-DAMPING, EASED, RAISED, LOWEST, HIGHEST = 1e-3, 8.0, 5.0, 1e-12, 1e12
+# First damping, by what it is divided after a good step and multiplied after a bad one, and its range. Each further bad
+# step in a row multiplies it by twice as much as the one before (Nielsen 1999, report IMM-REP-1999-05).
+DAMPING, EASED, RAISED, LOWEST, HIGHEST = 1e-3, 8.0, 4.0, 1e-12, 1e12
 # Singular values below this share of the largest count as zero: derivatives are no more exact.
 BLIND = 1e-8
 # The search has converged if the next step is shorter than this in units of the scales of the parameters, or would
 # lower the sum of squares by less than this share of it.
 SHORT, FLAT = 1e-9, 1e-14
+# A predicted fall below this share that does not come is lost in the round-off of the residuals.
+LOST = 1e-8
 # Share of the predicted fall of the sum of squares that a step must reach.
 WORTH = 1e-4
 
@@ -84,7 +88,7 @@ def least_squares(
     first = residuals(start, None)
     assert first is not None
     state = Search(start, first, np.zeros(len(start), int), [first.cost])
-    damping, norms = DAMPING, np.zeros(len(start))
+    damping, raised, norms = DAMPING, RAISED, np.zeros(len(start))
     while True:
         J, r = state.here.jacobian * scales, state.here.values
         norms = np.maximum(norms, np.linalg.norm(J, axis=0))
@@ -92,24 +96,42 @@ def least_squares(
         state.held = np.where(
             (state.theta <= low) & (slope > 0), -1, np.where((state.theta >= high) & (slope < 0), 1, 0)
         )
-        free = state.held == 0
-        step = _step(J, r, norms, free, damping)
-        trial = np.clip(state.theta + scales * step, low, high)
+        trial = _trial(state, J, norms, damping, low, high, scales)
         step = (trial - state.theta) / scales
         fall = state.here.cost - float(np.sum((r + J @ step) ** 2))
-        if np.abs(step).max() <= SHORT or fall <= FLAT * state.here.cost:
+        if np.abs(step).max() <= SHORT or abs(fall) <= FLAT * state.here.cost:
             state.status = DesignStatus.REACHED
             return state
         if state.trials > max_steps or damping > HIGHEST:
             return state
-        new = residuals(trial, state.here)
-        state.trials += 1
+        # A step to several bounds may lead uphill. A shorter one does not.
+        new = residuals(trial, state.here) if fall > 0 else None
+        state.trials += fall > 0
         if new is not None and state.here.cost - new.cost >= WORTH * fall:
-            state.theta, state.here, damping = trial, new, max(damping / EASED, LOWEST)
+            state.theta, state.here, damping, raised = trial, new, max(damping / EASED, LOWEST), RAISED
             state.costs.append(new.cost)
+        elif new is not None and fall <= LOST * state.here.cost:
+            state.status = DesignStatus.REACHED
+            return state
         else:
-            damping *= RAISED
+            damping, raised = damping * raised, 2 * raised
         report(state.trials, state.here.cost)
+
+
+def _trial(
+    state: Search, J: np.ndarray, norms: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray, scales: np.ndarray
+) -> np.ndarray:
+    """The next parameters `(q,)` to try, within the bounds."""
+    free, trial = state.held == 0, state.theta.copy()
+    while True:
+        r = state.here.values + J @ ((trial - state.theta) / scales)
+        wanted = state.theta + scales * _step(J, r, norms, free, damping)
+        past = free & ((wanted < low) | (wanted > high))
+        trial = np.where(free, np.clip(wanted, low, high), trial)
+        if not past.any():
+            return trial
+        free &= ~past
+        trial = np.where(free, state.theta, trial)
 
 
 def _step(J: np.ndarray, r: np.ndarray, norms: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:

@@ -19,11 +19,11 @@ from jax import lax
 
 from jaxbeam.core.compiling import compiled
 from jaxbeam.core.tree import unlock
-from jaxbeam.linear.layout import Layout
+from jaxbeam.linear.layout import Layout, expand, gather
 from jaxbeam.scene.scene import Scene, command
 from jaxbeam.solve.actuation import from_neighbour
 from jaxbeam.solve.equilibrium import solve_from
-from jaxbeam.solve.implicit import attach_derivative
+from jaxbeam.solve.implicit import attach_derivative, energy_gradient
 from jaxbeam.solve.newton import Newton, topology
 from jaxbeam.study.expansion import Measure
 
@@ -129,14 +129,18 @@ def _solve_block(
         scene = unlock(command(design(unravel(flat)), row))
         solution, factor = solve_from(from_neighbour(row, start, jnp.zeros_like(start)), scene, layout, solver)
         good = solution.status == 0
+        # One step more, with the factor that is there: else a search ends in what the solver leaves of the forces.
+        left = gather(layout, energy_gradient(scene, solution.x))
+        nearer = solution.x - expand(layout, solver.linear.solve(layout, factor, left), solution.x.shape)
+        found = jnp.where(good, nearer, solution.x)
 
         def outcome(flat: jax.Array) -> jax.Array:
             moved = command(design(unravel(flat)), row)
-            x = attach_derivative(solver.linear, unlock(moved), layout, solution.x, factor, good)
+            x = attach_derivative(solver.linear, unlock(moved), layout, found, factor, good)
             return jnp.ravel(measure(moved, x))
 
         values = outcome(flat)
         slopes = (jax.jacfwd if len(flat) <= len(values) else jax.jacrev)(outcome)(flat)
-        return Predicted(solution.x, values, slopes, solution.status, solution.steps)
+        return Predicted(found, values, slopes, solution.status, solution.steps)
 
     return lax.map(one, (commands, x))
