@@ -9,7 +9,6 @@ and 17).
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,18 +17,15 @@ import numpy as np
 from jaxbeam.core import checks
 from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.tree import Numbers
-from jaxbeam.scene.scene import check_commands, command, command_count
+from jaxbeam.scene.scene import Scene, check_commands, command, command_count
 from jaxbeam.solve.equilibrium import equilibrium
 from jaxbeam.solve.solution import check
 from jaxbeam.solve.sweep import sweep
 from jaxbeam.study.accuracy import estimate_error
 from jaxbeam.study.expansion import Measure
 from jaxbeam.study.fit import Fit
-from jaxbeam.study.known import what_is_known
+from jaxbeam.study.known import is_hidden, what_is_known
 from jaxbeam.study.observing import Predicted, predict_all
-
-# Share of what the parameters change in a measure up to which a combination that is not determined has no effect on it.
-UNSEEN = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +48,7 @@ def predict(fitted: Fit, commands: Numbers, measure: Measure, *, bars: bool = Fa
     """A measure under new commands, with its standard error.
 
     The error is that of the parameters alone: not that of a measurement, which adds its own variance, and not that of
-    the model. `bars=True` tells that of the mesh.
+    the model. A parameter that a bound holds is taken as exact. `bars=True` tells the error of the mesh.
 
     Args:
         fitted: from `fit`.
@@ -69,20 +65,31 @@ def predict(fitted: Fit, commands: Numbers, measure: Measure, *, bars: bool = Fa
     scene = basis.model.scene(jnp.asarray(basis.flat))
     shape = (len(rows), *jax.eval_shape(measure, scene, scene.mesh.nodes).shape)
     variances = np.einsum("kpi,ij,kpj->kp", found.slopes, known.covariance, found.slopes)
-    scaled = found.slopes * basis.scales
-    hidden = np.linalg.norm(scaled @ known.blind.T, axis=2) > UNSEEN * np.linalg.norm(scaled, axis=2)
+    hidden = is_hidden(found.slopes * basis.scales, known.singular_values, known.directions)
     errors = np.where(hidden, np.inf, np.sqrt(variances))
     told = None
     if bars:
-        told = np.array([_bar(command(scene, row), x, measure) for row, x in zip(rows, found.x, strict=True)])
+        parts = [Component(measure, j) for j in range(found.values.shape[1])]
+        told = np.array([_bars(command(scene, row), x, parts) for row, x in zip(rows, found.x, strict=True)])
         told = told.reshape(shape)
     return Prediction(found.values.reshape(shape), errors.reshape(shape), told)
 
 
-def _bar(scene: Any, x: np.ndarray, measure: Measure) -> np.ndarray:
+@dataclasses.dataclass(frozen=True)
+class Component:
+    """One component of a measure; equal to another of the same, so that programs are compiled once."""
 
+    measure: Measure
+    number: int
+
+    def __call__(self, scene: Scene, x: jax.Array) -> jax.Array:
+        return jnp.ravel(self.measure(scene, x))[self.number]
+
+
+def _bars(scene: Scene, x: np.ndarray, parts: list[Component]) -> list[float]:
+    """The error bar of the mesh of each component at the equilibrium nearest to `x` `(n, d)`."""
     solution = check(equilibrium(scene, x))
-    return np.asarray(estimate_error(scene, solution, measure).bar)
+    return [float(estimate_error(scene, solution, part).bar) for part in parts]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,8 +98,8 @@ class Experiments:
 
     best: number of the candidate that adds most.
     errors: `(K, q)` standard errors of the parameters after it; NaN for those that are not determined even then.
-    information: `(K,)` half of the logarithm of the determinant of the scaled information matrix after it, less that
-        before it.
+    information: `(K,)` by how much it shrinks the logarithm of the volume of the confidence region. Each scaled
+        parameter is taken as known beforehand to within its scale, so that there is one also of what is not determined.
     """
 
     best: int
@@ -137,7 +144,8 @@ def next_experiment(
     known = lambda J: what_is_known(J, basis.scales, basis.free, basis.positive, fitted.names, basis.variance)
     after = [known(np.concatenate([basis.jacobian, new])) for new in rows]
     errors = np.stack([each.errors for each in after])
-    volume = lambda sizes: float(np.sum(np.log(np.maximum(sizes, np.finfo(float).tiny))))
+    # Half of the logarithm of the determinant of 1 + J^T J (Chaloner and Verdinelli 1995, Statist. Sci. 10, 273-304).
+    volume = lambda sizes: float(np.sum(np.log1p(sizes**2)) / 2)
     information = np.array([volume(each.singular_values) for each in after]) - volume(basis.known.singular_values)
     merit = -information if parameter is None else errors[:, fitted.names.index(parameter)]
     if np.isnan(merit).all():

@@ -28,7 +28,7 @@ from jaxbeam.solve.solution import check
 from jaxbeam.solve.sweep import sweep
 from jaxbeam.study.design import DesignStatus
 from jaxbeam.study.expansion import Measure
-from jaxbeam.study.known import Known, what_is_known
+from jaxbeam.study.known import Known, scales_of, what_is_known
 from jaxbeam.study.least_squares import Residuals, least_squares
 from jaxbeam.study.observing import Design, Model, Predicted, model_of, predict_all
 
@@ -107,7 +107,7 @@ class Basis:
 
     model: the design.
     measure: of the observations.
-    sd: `(p,)` median standard deviations of the components.
+    sd: `(p,)` median standard deviations of the components, infinite for one that was not measured.
     flat: `(q,)` parameters.
     jacobian: `(r, q)` of all residuals, priors included.
     scales, free, positive, variance: as in `what_is_known`.
@@ -189,7 +189,6 @@ def fit(
             f"measure more, fit fewer parameters, or give a prior"
         )
     model, beliefs = model_of(design, unravel, start, solver), _beliefs(prior, unravel)
-    scales = _scales(start, low, high)
     solves = 0
     with Report(progress, f"steps of at most {max_steps}") as report:
         first = check(sweep(scene, rows, solver=solver))
@@ -201,9 +200,9 @@ def fit(
             return None if found.status.any() else _residuals(found, data, deviations, *beliefs(flat))
 
         tell = lambda steps, cost: report(steps, f"sum of squares {cost:.4e}", (steps, cost))
-        ended = least_squares(residuals, start, low, high, scales, max_steps, tell)
+        ended = least_squares(residuals, start, low, high, max_steps, tell)
     known_sd = sd is not None
-    return _fit(ended, model, measure, deviations, known_sd, _scales(ended.theta, low, high), names, unravel, solves)
+    return _fit(ended, model, measure, deviations, known_sd, start, names, unravel, solves)
 
 
 # -------------------------------------------------------------------------------------------------- arguments
@@ -300,12 +299,6 @@ def _beliefs(prior: Prior | None, unravel: Callable[[jax.Array], Any]) -> Callab
     return lambda flat: (np.asarray(values(jnp.asarray(flat))), np.asarray(slopes(jnp.asarray(flat))))
 
 
-def _scales(theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """What counts as a change of each parameter by all of it: its magnitude; of zero the width of its bounds, or 1."""
-    width = np.where(np.isfinite(high - low), high - low, 1.0)
-    return np.where(theta != 0, np.abs(theta), np.where(width > 0, width, 1.0))
-
-
 # --------------------------------------------------------------------------------------------------- residuals
 
 
@@ -322,14 +315,15 @@ def _fit(
     measure: Measure,
     sd: np.ndarray,
     known_sd: bool,
-    scales: np.ndarray,
+    start: np.ndarray,
     names: list[str],
     unravel: Callable[[jax.Array], Any],
     solves: int,
 ) -> Fit:
     """The report of a search."""
     here, found, free = ended.here, ended.here.other, ended.held == 0
-    positive = ended.theta > 0
+    positive = (ended.theta > 0) & (start > 0)
+    scales = scales_of(ended.theta, start, here.jacobian)
     count = int(np.isfinite(sd).sum()) + len(here.values) - sd.size
     rank = int(np.linalg.matrix_rank(here.jacobian[:, free] * scales[free])) if free.any() else 0
     freedom = count - rank
@@ -337,11 +331,11 @@ def _fit(
     variance = 1.0 if known_sd or not chi_square > 0 else chi_square
     known = what_is_known(here.jacobian, scales, free, positive, names, variance)
     residuals = here.values[: sd.size].reshape(sd.shape)
-    finite = np.where(np.isfinite(sd), sd, np.nan)
+    typical = [np.median(part[np.isfinite(part)]) if np.isfinite(part).any() else np.inf for part in sd.T]
     basis = Basis(
         model,
         measure,
-        np.nanmedian(finite, axis=0),
+        np.array(typical),
         ended.theta,
         here.jacobian,
         scales,

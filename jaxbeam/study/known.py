@@ -3,8 +3,8 @@
 Parameters are scaled, and residuals divided by their standard deviations. So a singular value of the Jacobian tells by
 how many standard deviations the residuals change when a combination of parameters changes by its scale (Bates and Watts
 1988, Nonlinear Regression Analysis, ch. 2; Brun, Reichert and Kuensch 2001, Water Resour. Res. 37, 1015-1030). A
-combination whose change by all of its scale moves them by less than one standard deviation is not determined. Nothing
-is told of it but that.
+combination whose change by all of its scale moves them by less than one standard deviation is not determined. Of a
+parameter, or a prediction, with most of its variance from such combinations nothing is told but that.
 """
 
 from __future__ import annotations
@@ -14,8 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 # A combination of parameters is determined if its change by its scale changes the residuals by more than this many
-# standard deviations, and by more than this share of what the best determined one does: below that is round-off.
-LEAST, ROUNDED = 1.0, 1e-9
+# standard deviations. Below this share of what the best determined one does all is round-off.
+LEAST, ROUNDED = 1.0, 1e-8
+# A quantity depends on what is round-off if more than this share of its change is along it, and is told without an
+# error if more than this share of its variance comes from combinations that are not determined.
+UNSEEN, MOST = 1e-6, 0.5
+# A scale for a parameter that may be zero, and has none of its own: so many standard deviations of it, were it alone.
+ALONE = 100.0
 # Components of a combination that count; relative difference up to which components are alike.
 COUNTS, ALIKE = 0.05, 0.02
 # The most parameters that are named in a combination.
@@ -23,22 +28,32 @@ SHOWN = 6
 
 
 class Known(NamedTuple):
-    """What is known of `q` parameters.
+    """What is known of `q` parameters, of which `f` are free.
 
-    singular_values: `(f,)` of the scaled Jacobian of the `f` parameters that are free, largest first.
-    covariance: `(q, q)` of the parameters, of what is determined of them alone; zero for those that are not free.
+    singular_values: `(f,)` of the scaled Jacobian of the free parameters, largest first.
+    directions: `(f, q)` the combinations of scaled parameters that they belong to.
+    covariance: `(q, q)` of the parameters, without what is round-off; zero for those that are not free.
     errors: `(q,)` standard errors; NaN for a parameter that is not determined or not free.
     correlations: `(q, q)`; NaN where an error is.
-    blind: `(u, q)` combinations of scaled parameters that are not determined.
     words: what is not determined, one entry for each combination.
     """
 
     singular_values: np.ndarray
+    directions: np.ndarray
     covariance: np.ndarray
     errors: np.ndarray
     correlations: np.ndarray
-    blind: np.ndarray
     words: list[str]
+
+
+def scales_of(theta: np.ndarray, start: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """What counts as a change of each parameter `(q,)` by all of it: its magnitude.
+
+    A parameter that started at zero, or changed its sign, may well be zero, as an offset or a misalignment is. Its
+    magnitude is then no measure of anything, and what the residuals `(r, q)` say of it alone stands in for it.
+    """
+    norms = np.linalg.norm(jacobian, axis=0)
+    return np.where(theta * start > 0, np.abs(theta), np.where(norms > 0, ALONE / np.where(norms > 0, norms, 1), 1))
 
 
 def what_is_known(
@@ -50,7 +65,7 @@ def what_is_known(
         jacobian: `(r, q)` of the residuals over their standard deviations.
         scales: `(q,)` of the parameters, positive.
         free: `(q,)` which are not held by a bound.
-        positive: `(q,)` whether the scale is the magnitude of the parameter, so that changes are relative ones.
+        positive: `(q,)` whether the scale is the magnitude of a positive parameter, so that changes are relative ones.
         names: of the parameters.
         variance: of the residuals: 1 if their standard deviations are known.
     """
@@ -59,18 +74,36 @@ def what_is_known(
     # Rows of zeros make the singular vectors a basis of all parameters, also where residuals are fewer.
     padded = np.concatenate([scaled, np.zeros((max(0, len(where) - len(scaled)), len(where)))])
     _, sizes, rows = np.linalg.svd(padded, full_matrices=False)
-    determined = (sizes > LEAST) & (sizes > ROUNDED * sizes.max(initial=0.0))
-    blind = np.zeros((int((~determined).sum()), q))
-    blind[:, where] = _sparse(rows[~determined])
-    spread = np.zeros((q, int(determined.sum())))
-    spread[where] = scales[where, None] * rows[determined].T / sizes[determined]
+    directions = np.zeros((len(where), q))
+    directions[:, where] = rows
+    spread = scales[:, None] * directions.T * _inverse(sizes)
     covariance = spread @ spread.T
-    lost = ~free | (np.abs(blind) > COUNTS).any(axis=0)
-    errors = np.where(lost, np.nan, np.sqrt(np.diag(covariance)))
+    lost = ~free | is_hidden(np.eye(q), sizes, directions)
     # An error of zero belongs to a parameter without an effect, which is lost.
+    errors = np.where(lost, np.nan, np.sqrt(np.diag(covariance)))
     correlations = covariance / np.outer(errors, errors)
-    words = [_in_words(row, positive, names) for row in blind]
-    return Known(sizes, covariance, errors, correlations, blind, words)
+    blind = _sparse(directions[~_determined(sizes)])
+    words = [_in_words(row, scales, positive, lost & free, names) for row in blind]
+    return Known(sizes, directions, covariance, errors, correlations, [each for each in words if each])
+
+
+def is_hidden(slopes: np.ndarray, sizes: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Whether a quantity hangs on what is not determined, for derivatives `(..., q)` by scaled parameters."""
+    along = slopes @ directions.T
+    there = _inverse(sizes) > 0
+    rounded = np.linalg.norm(along[..., ~there], axis=-1) > UNSEEN * np.linalg.norm(along, axis=-1)
+    parts = (along * _inverse(sizes)) ** 2
+    return rounded | (parts[..., ~_determined(sizes)].sum(axis=-1) > MOST * parts.sum(axis=-1))
+
+
+def _determined(sizes: np.ndarray) -> np.ndarray:
+    return (sizes > LEAST) & (_inverse(sizes) > 0)
+
+
+def _inverse(sizes: np.ndarray) -> np.ndarray:
+    """One over each singular value, zero for those that are round-off."""
+    there = sizes > ROUNDED * sizes.max(initial=0.0)
+    return np.where(there, 1 / np.where(there, sizes, 1), 0)
 
 
 def _sparse(basis: np.ndarray) -> np.ndarray:
@@ -88,9 +121,11 @@ def _sparse(basis: np.ndarray) -> np.ndarray:
     return found / np.where(norms > 0, norms, 1)
 
 
-def _in_words(row: np.ndarray, positive: np.ndarray, names: list[str]) -> str:
-    """A combination that is not determined, in words."""
-    parts = np.flatnonzero(np.abs(row) > COUNTS)
+def _in_words(row: np.ndarray, scales: np.ndarray, positive: np.ndarray, lost: np.ndarray, names: list[str]) -> str:
+    """A combination `(q,)` of scaled parameters that is not determined, in words; empty if all of it is known still."""
+    if not lost[np.abs(row) > COUNTS].any():
+        return ""
+    parts = np.flatnonzero((np.abs(row) > COUNTS) | (lost & (np.abs(row) > UNSEEN)))
     row = row / row[parts[np.argmax(np.abs(row[parts]))]]
     listed = [names[k] for k in parts]
     if len(parts) == 1:
@@ -100,8 +135,9 @@ def _in_words(row: np.ndarray, positive: np.ndarray, names: list[str]) -> str:
         return f"{several} only as a ratio" if len(parts) == 2 else f"{several} only as ratios of each other"
     if positive[parts].all() and len(parts) == 2 and np.isclose(row[parts].sum(), 0, atol=ALIKE):
         return f"{several} only as a product"
-    shown = parts[np.argsort(-np.abs(row[parts]))[:SHOWN]]
-    changes = ", ".join(f"{names[k]} by {row[k]:+.3g}" + " of itself" * bool(positive[k]) for k in shown)
+    shown = parts[np.argsort(-np.abs(row[parts]), kind="stable")[:SHOWN]]
+    amounts = [f"{row[k]:+.3g} of itself" if positive[k] else f"{row[k] * scales[k]:+.3g}" for k in shown]
+    changes = ", ".join(f"{names[k]} by {amount}" for k, amount in zip(shown, amounts, strict=True))
     others = f" and {len(parts) - len(shown)} others" if len(parts) > len(shown) else ""
     who = several if len(parts) <= SHOWN else f"{len(parts)} parameters"
-    return f"{who} only in a combination: changing {changes}{others}, in this proportion, changes nothing measured"
+    return f"{who} only in a combination: changing {changes}{others}, in this proportion, does not show in the data"

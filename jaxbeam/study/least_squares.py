@@ -22,9 +22,10 @@ from jaxbeam.study.design import DesignStatus
 DAMPING, EASED, RAISED, LOWEST, HIGHEST = 1e-3, 8.0, 4.0, 1e-12, 1e12
 # Singular values below this share of the largest count as zero: derivatives are no more exact.
 BLIND = 1e-8
-# The search has converged if the next step is shorter than this in units of the scales of the parameters, or would
-# lower the sum of squares by less than this share of it.
-SHORT, FLAT = 1e-9, 1e-14
+# The search has converged if the next step changes each parameter by less than this share of it, or the residuals by
+# less than this share of what all of the parameters do; or if it would lower the sum of squares by less than this
+# share of it.
+SHORT, SLIGHT, FLAT = 1e-9, 1e-12, 1e-14
 # A predicted fall below this share that does not come is lost in the round-off of the residuals.
 LOST = 1e-8
 # Share of the predicted fall of the sum of squares that a step must reach.
@@ -69,7 +70,6 @@ def least_squares(
     start: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    scales: np.ndarray,
     max_steps: int,
     report: Callable[[int, float], None],
 ) -> Search:
@@ -81,7 +81,6 @@ def least_squares(
         start: `(q,)` parameters within the bounds, at which residuals exist.
         low: lower bounds.
         high: upper bounds.
-        scales: `(q,)` of the parameters.
         max_steps: the most trials.
         report: called after each trial with their number and the sum of squares.
     """
@@ -90,16 +89,18 @@ def least_squares(
     state = Search(start, first, np.zeros(len(start), int), [first.cost])
     damping, raised, norms = DAMPING, RAISED, np.zeros(len(start))
     while True:
-        J, r = state.here.jacobian * scales, state.here.values
+        J, r = state.here.jacobian, state.here.values
         norms = np.maximum(norms, np.linalg.norm(J, axis=0))
         slope = J.T @ r
         state.held = np.where(
             (state.theta <= low) & (slope > 0), -1, np.where((state.theta >= high) & (slope < 0), 1, 0)
         )
-        trial = _trial(state, J, norms, damping, low, high, scales)
-        step = (trial - state.theta) / scales
+        trial = _trial(state, J, norms, damping, low, high)
+        step = trial - state.theta
         fall = state.here.cost - float(np.sum((r + J @ step) ** 2))
-        if np.abs(step).max() <= SHORT or abs(fall) <= FLAT * state.here.cost:
+        slight = SLIGHT * np.linalg.norm(norms * state.theta)
+        short = (np.abs(step) <= SHORT * np.abs(state.theta)) | (norms * np.abs(step) <= slight)
+        if short.all() or abs(fall) <= FLAT * state.here.cost:
             state.status = DesignStatus.REACHED
             return state
         if state.trials > max_steps or damping > HIGHEST:
@@ -119,13 +120,13 @@ def least_squares(
 
 
 def _trial(
-    state: Search, J: np.ndarray, norms: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray, scales: np.ndarray
+    state: Search, J: np.ndarray, norms: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """The next parameters `(q,)` to try, within the bounds."""
     free, trial = state.held == 0, state.theta.copy()
     while True:
-        r = state.here.values + J @ ((trial - state.theta) / scales)
-        wanted = state.theta + scales * _step(J, r, norms, free, damping)
+        r = state.here.values + J @ (trial - state.theta)
+        wanted = state.theta + _step(J, r, norms, free, damping)
         past = free & ((wanted < low) | (wanted > high))
         trial = np.where(free, np.clip(wanted, low, high), trial)
         if not past.any():
