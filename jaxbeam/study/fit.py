@@ -22,20 +22,24 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.progress import Progress, Report, check_progress
 from jaxbeam.core.tree import Numbers
 from jaxbeam.scene.rigid import check_held
-from jaxbeam.scene.scene import Scene, check_commands, command_count
 from jaxbeam.solve.newton import Newton, check_scene_and_solver
 from jaxbeam.solve.solution import check
 from jaxbeam.solve.sweep import sweep
 from jaxbeam.study.design import DesignStatus
 from jaxbeam.study.expansion import Measure
-from jaxbeam.study.known import Known, scales_of, what_is_known
+from jaxbeam.study.fit_data import bounds_of, data_of, parameters_of
+from jaxbeam.study.known import ROUNDED, Known, scales_of, what_is_known
 from jaxbeam.study.least_squares import Residuals, least_squares
 from jaxbeam.study.observing import Design, Model, Predicted, model_of, predict_all
 
 # Probability that of good residuals none is called an outlier.
 SURE = 0.99
+# Normal standard deviations beyond which a sum of squares is not called chance.
+CHANCE = 3.5
 # The median of the magnitude of a normal variable of unit variance.
 MEDIAN = 0.6745
+# Efficiency of that median as a measure of size, of normal variables (Huber 1981, Robust Statistics, ch. 5).
+WORTH = 0.37
 
 Prior = Callable[[Any], jax.Array]
 
@@ -94,6 +98,7 @@ class Fit:
         lines += [f"not determined: {words}" for words in self.not_determined]
         lines.append(
             f"reduced chi-square {self.reduced_chi_square:.4g} of {self.degrees_of_freedom} degrees of freedom"
+            + _judged(self.reduced_chi_square, self.degrees_of_freedom) * self.basis.known_sd
         )
         if len(self.outliers):
             each = ", ".join(f"{k} (component {j}, {self.residuals[k, j]:+.3g})" for k, j in self.outliers[:8].tolist())
@@ -111,6 +116,7 @@ class Basis:
     flat: `(q,)` parameters.
     jacobian: `(r, q)` of all residuals, priors included.
     scales, free, positive, variance: as in `what_is_known`.
+    known_sd: whether standard deviations were given.
     known: what is known of the parameters.
     """
 
@@ -123,7 +129,19 @@ class Basis:
     free: np.ndarray
     positive: np.ndarray
     variance: float
+    known_sd: bool
     known: Known
+
+
+def _judged(reduced_chi_square: float, freedom: int) -> str:
+    """What its size tells, in words, where it is too far from 1 to be chance (Wilson and Hilferty 1931)."""
+    if freedom <= 0:
+        return ""
+    spread = 2 / (9 * freedom)
+    away = (reduced_chi_square ** (1 / 3) - (1 - spread)) / spread**0.5
+    if away > CHANCE:
+        return ": too large for chance, so the model is wrong, or values or sd are, and errors are too small"
+    return ": too small for chance, so sd is too large, and errors are too" if away < -CHANCE else ""
 
 
 @usual_rules
@@ -149,13 +167,14 @@ def fit(
 
     Args:
         design: `theta` to a scene; its commands are replaced by those of each observation.
-        theta0: parameters to start from, any pytree of floats. A dict gives them names: `{"young": 1e4}`.
+        theta0: parameters to start from, any pytree of floats. A dict gives them names: `{"young": 1e4}`. Start one
+            that may be zero, such as an offset, at zero.
         commands: `(N, m)` a row for each observation.
         values: `(N,)` or `(N, p)` what was measured there.
         measure: `(scene, x)` to `()` or `(p,)`: what was measured, such as `tip_position`, or markers and tensions in
             one array; a function at module level.
         sd: standard deviations of the values: `()`, `(p,)` or `(N, p)`, infinite for a value that is missing. If they
-            are not known, all are taken alike, and the residuals tell their size.
+            are not known, all are taken alike, and the residuals tell their size; a prior needs them.
         bounds: lowest and highest parameters, each as `theta0` or as one number.
         prior: `theta` to `(k,)`: residuals of what is known beforehand, over their standard deviations, such as
             `lambda theta: (theta["poisson"] - 0.45) / 0.02`.
@@ -170,23 +189,34 @@ def fit(
 
     Raises:
         ValueError: if a shape is wrong, a value is not finite, an `sd` is not positive, commands are out of range,
-            `theta0` is not within the bounds, or there are fewer data than parameters and no prior.
+            `theta0` is not within the bounds, the measure or the prior has no derivative there, there are fewer data
+            than parameters and no prior, or no more and no `sd`.
         EquilibriumError: if an observation has no equilibrium that is `OK` at `theta0`. It names the observations.
     """
     checks.function("design", design, "(theta) -> scene")
     checks.function("measure", measure, "(scene, x) to shape () or (p,)")
     checks.count("max_steps", max_steps, 1)
     check_progress(progress, "(steps, sum_of_squares)")
-    start, unravel, names = _parameters(theta0)
-    low, high = _bounds(bounds, theta0, start, names)
+    start, unravel, names = parameters_of(theta0)
+    low, high = bounds_of(bounds, theta0, start, names)
     scene = design(unravel(jnp.asarray(start)))
     check_scene_and_solver(scene, solver)
     check_held(scene)
-    rows, data, deviations = _data(scene, commands, values, measure, sd)
-    if data.size - np.isinf(deviations).sum() < len(start) and prior is None:
+    rows, data, deviations = data_of(scene, commands, values, measure, sd)
+    count = int(np.isfinite(deviations).sum())
+    if sd is None and prior is not None:
         raise ValueError(
-            f"values: expected at least as many as parameters, {len(start)}, got {np.isfinite(deviations).sum()}; "
-            f"measure more, fit fewer parameters, or give a prior"
+            "sd: expected standard deviations beside a prior, got None; give them, so that both have weights"
+        )
+    if sd is None and count <= len(start):
+        raise ValueError(
+            f"values: expected more than parameters, {len(start)}, got {count}: nothing tells their error; measure "
+            f"more, fit fewer parameters, or give sd"
+        )
+    if count < len(start) and prior is None:
+        raise ValueError(
+            f"values: expected at least as many as parameters, {len(start)}, got {count}; measure more, fit fewer "
+            f"parameters, or give a prior"
         )
     model, beliefs = model_of(design, unravel, start, solver), _beliefs(prior, unravel)
     solves = 0
@@ -197,96 +227,15 @@ def fit(
             nonlocal solves
             found = predict_all(model, flat, rows, first.x if before is None else before.other.x, measure)
             solves += len(rows)
-            return None if found.status.any() else _residuals(found, data, deviations, *beliefs(flat))
+            here = _residuals(found, data, deviations, *beliefs(flat))
+            if before is None:
+                _check_start(here, names)
+            return here if _is_good(here) else None
 
         tell = lambda steps, cost: report(steps, f"sum of squares {cost:.4e}", (steps, cost))
         ended = least_squares(residuals, start, low, high, max_steps, tell)
     known_sd = sd is not None
     return _fit(ended, model, measure, deviations, known_sd, start, names, unravel, solves)
-
-
-# -------------------------------------------------------------------------------------------------- arguments
-
-
-def _parameters(theta0: Any) -> tuple[np.ndarray, Callable[[jax.Array], Any], list[str]]:
-    """Flat parameters `(q,)`, their way back, and their names."""
-    leaves = jax.tree_util.tree_leaves_with_path(theta0)
-    if not leaves:
-        raise ValueError(f"theta0: expected a pytree of floats, got {theta0!r}")
-    names = []
-    for path, leaf in leaves:
-        array = checks.numbers("theta0" + jax.tree_util.keystr(path), leaf)
-        word = (
-            ".".join(str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key)))) for key in path)
-            or "theta"
-        )
-        names += [word] if array.ndim == 0 else [f"{word}{list(place)}" for place in np.ndindex(array.shape)]
-    flat, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), theta0))
-    return np.asarray(flat, float), unravel, names
-
-
-def _bounds(
-    bounds: tuple[Any, Any] | None, theta0: Any, start: np.ndarray, names: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest parameters `(q,)`."""
-    if bounds is None:
-        return np.full(len(start), -np.inf), np.full(len(start), np.inf)
-    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-        raise ValueError(f"bounds: expected (low, high), each as theta0 or one number, got {bounds!r}")
-    ends = []
-    for name, end in zip(("low", "high"), bounds, strict=True):
-        try:
-            whole = end if np.ndim(end) == 0 and not isinstance(end, dict) else None
-            flat = np.full(len(start), whole, float) if whole is not None else np.asarray(ravel_pytree(end)[0], float)
-        except (TypeError, ValueError):
-            flat = np.zeros(0)
-        same = whole is not None or str(jax.tree.structure(end)) == str(jax.tree.structure(theta0))
-        if len(flat) != len(start) or not same:
-            raise ValueError(f"bounds, {name}: expected the structure of theta0, or one number, got {end!r}")
-        ends.append(flat)
-    low, high = ends
-    bad = np.flatnonzero(~((low <= start) & (start <= high)))
-    if bad.size:
-        k = bad[0]
-        raise ValueError(
-            f"bounds: expected low <= theta0 <= high, got {low[k]:g}, {start[k]:g}, {high[k]:g} of {names[k]}"
-        )
-    return low, high
-
-
-def _data(
-    scene: Scene, commands: Any, values: Any, measure: Measure, sd: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Commands `(N, m)`, values `(N, p)` and standard deviations `(N, p)`, checked."""
-    rows, data, m = checks.real("commands", commands), checks.real("values", values), command_count(scene)
-    if rows.ndim != 2 or rows.shape[1] != m or not len(rows):
-        raise ValueError(f"commands: expected shape (N, {m}), a row for each observation, got {rows.shape}")
-    shape = jax.eval_shape(measure, scene, scene.mesh.nodes).shape
-    if len(shape) > 1:
-        raise ValueError(f"measure: expected a function (scene, x) to shape () or (p,), got shape {shape}")
-    if data.shape != (len(rows), *shape):
-        raise ValueError(
-            f"values: expected shape {(len(rows), *shape)}, what the measure gives for each of the commands, got "
-            f"{data.shape}"
-        )
-    data = data.reshape(len(rows), -1).astype(float)
-    for name, array in (("commands", rows), ("values", data)):
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        if bad.size:
-            others = f", and {bad.size - 1} others are not" if bad.size > 1 else ""
-            raise ValueError(
-                f"{name}: observation {bad[0]} is not finite, {array[bad[0]].tolist()}{others}; leave such rows out, "
-                f"or where one value of a row is missing, put 0 there and infinity in sd"
-            )
-    check_commands("commands", scene, rows)
-    deviations = checks.real("sd", 1.0 if sd is None else sd)
-    if deviations.shape not in {(), shape, (len(rows), *shape)}:
-        raise ValueError(f"sd: expected shape (), {shape} or {(len(rows), *shape)}, got {deviations.shape}")
-    deviations = np.broadcast_to(deviations, (len(rows), *shape)).reshape(data.shape)
-    if not (deviations > 0).all():
-        k, j = np.argwhere(~(deviations > 0))[0]
-        raise ValueError(f"sd: expected positive numbers, got {deviations[k, j]} for observation {k}, component {j}")
-    return rows.astype(float), data, deviations.astype(float)
 
 
 def _beliefs(prior: Prior | None, unravel: Callable[[jax.Array], Any]) -> Callable[[np.ndarray], tuple[Any, Any]]:
@@ -309,6 +258,28 @@ def _residuals(found: Predicted, data: np.ndarray, sd: np.ndarray, prior: np.nda
     return Residuals(np.concatenate([misses, prior]), np.concatenate([jacobian, slopes]), found)
 
 
+def _is_good(here: Residuals) -> bool:
+    """Whether all equilibria are `OK`, and all residuals and their derivatives finite."""
+    return bool(not here.other.status.any() and np.isfinite(here.values).all() and np.isfinite(here.jacobian).all())
+
+
+def _check_start(here: Residuals, names: list[str]) -> None:
+    """Refuse a start that a search cannot leave."""
+    if _is_good(here):
+        return
+    found, size = here.other, here.other.values.size
+    bad = ~(np.isfinite(found.values).all(axis=1) & np.isfinite(found.slopes).all(axis=(1, 2)))
+    if bad.any():
+        k = int(np.argmax(bad))
+        slopes = np.where(np.isfinite(found.slopes[k]).all(axis=0), "", names)
+        raise ValueError(
+            f"measure: expected finite values and derivatives at theta0, got {found.values[k].tolist()} for "
+            f"observation {k}, with no derivative by {', '.join(slopes[slopes != '']) or 'none'}; a square root or a "
+            f"norm has none at zero"
+        )
+    raise ValueError(f"prior: expected finite residuals and derivatives at theta0, got {here.values[size:].tolist()}")
+
+
 def _fit(
     ended: Any,
     model: Model,
@@ -325,7 +296,7 @@ def _fit(
     positive = (ended.theta > 0) & (start > 0)
     scales = scales_of(ended.theta, start, here.jacobian)
     count = int(np.isfinite(sd).sum()) + len(here.values) - sd.size
-    rank = int(np.linalg.matrix_rank(here.jacobian[:, free] * scales[free])) if free.any() else 0
+    rank = int(np.linalg.matrix_rank(here.jacobian[:, free] * scales[free], rtol=ROUNDED)) if free.any() else 0
     freedom = count - rank
     chi_square = here.cost / freedom if freedom > 0 else np.nan
     variance = 1.0 if known_sd or not chi_square > 0 else chi_square
@@ -342,6 +313,7 @@ def _fit(
         free,
         positive,
         variance,
+        known_sd,
         known,
     )
     return Fit(
@@ -353,7 +325,7 @@ def _fit(
         names=names,
         values=found.values,
         residuals=residuals,
-        outliers=_outliers(here, scales * free, np.isfinite(sd), known_sd),
+        outliers=_outliers(here, scales * free, np.isfinite(sd), known_sd, _round_off(found, sd)),
         reduced_chi_square=float(chi_square),
         degrees_of_freedom=freedom,
         held=ended.held,
@@ -365,20 +337,37 @@ def _fit(
     )
 
 
-def _outliers(here: Residuals, scales: np.ndarray, present: np.ndarray, known_sd: bool) -> np.ndarray:
+def _round_off(found: Predicted, sd: np.ndarray) -> np.ndarray:
+    """Residuals `(N, p)` that round-off may leave of each component: the root of that of one operation."""
+    return np.sqrt(np.finfo(found.x.dtype).eps) * np.abs(found.values).max(axis=0) / sd
+
+
+def _student(z: float, freedom: float) -> float:
+    """The quantile of Student's distribution where the normal one is `z` (Abramowitz and Stegun 1972, 26.7.5)."""
+    terms = ((z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
+    return z + sum(term / freedom**k for k, term in enumerate(terms, 1))
+
+
+def _outliers(
+    here: Residuals, scales: np.ndarray, present: np.ndarray, known_sd: bool, least: np.ndarray
+) -> np.ndarray:
     """Observation and component `(k, 2)` of residuals that are too large to be chance, the largest first.
 
     A residual is divided by its own standard deviation, which the fit makes smaller: `sqrt(1 - h)`, with `h` the
-    diagonal of the hat matrix (Cook and Weisberg 1982). If standard deviations are not known, their size is taken from
-    the median of the magnitudes, which outliers hardly change.
+    diagonal of the hat matrix (Cook and Weisberg 1982). Their size is taken from the median of the magnitudes, which
+    outliers hardly change, but where the standard deviations are known not as less than these: if all of them are given
+    too small, no value is worse than the others. The median tells a size as well as `WORTH` of all residuals would by
+    their squares, and so the limit is that of Student's distribution. What is round-off of the values is no outlier.
     """
     data = here.values[: present.size]
     u, sizes, _ = np.linalg.svd(here.jacobian * scales, full_matrices=False)
     hat = np.sum(u[: present.size, sizes > 1e-9 * sizes.max(initial=0)] ** 2, axis=1)
     own = np.abs(data) / np.sqrt(np.maximum(1 - hat, 1e-6))
     there = present.ravel()
-    size = 1.0 if known_sd else float(np.median(own[there])) / MEDIAN
+    size = max(float(known_sd), float(np.median(own[there])) / MEDIAN)
     limit = NormalDist().inv_cdf(1 - (1 - SURE) / (2 * there.sum()))
-    large = np.flatnonzero(there & (own > limit * size)) if size > 0 else np.zeros(0, int)
+    if not known_sd:
+        limit = _student(limit, WORTH * max(1.0, there.sum() - hat.sum()))
+    large = np.flatnonzero(there & (own > limit * size) & (own > least.ravel()))
     large = large[np.argsort(-own[large])]
     return np.stack(np.unravel_index(large, present.shape), axis=1)
