@@ -60,7 +60,8 @@ def predict(fitted: Fit, commands: Numbers, measure: Measure, *, bars: bool = Fa
         ValueError: if commands are of another shape or out of range, or `measure` is no function.
         EquilibriumError: if a command has no equilibrium that is `OK`.
     """
-    rows, found = _solved(fitted, commands, measure)
+    checks.instance("fitted", fitted, Fit, "give what fit returned")
+    rows, found = _solved("commands", fitted, commands, measure)
     known, basis = fitted.basis.known, fitted.basis
     scene = basis.model.scene(jnp.asarray(basis.flat))
     shape = (len(rows), *jax.eval_shape(measure, scene, scene.mesh.nodes).shape)
@@ -131,12 +132,13 @@ def next_experiment(
             or no candidate determines the parameter.
         EquilibriumError: if a candidate has no equilibrium that is `OK`.
     """
+    checks.instance("fitted", fitted, Fit, "give what fit returned")
     basis = fitted.basis
     if parameter is not None and parameter not in fitted.names:
         raise ValueError(f"parameter: expected one of {', '.join(fitted.names)}, got {parameter!r}")
     if measure is not None and sd is None:
         raise ValueError("sd: expected the standard deviations of the new measure, got none")
-    _, found = _solved(fitted, candidates, basis.measure if measure is None else measure)
+    _, found = _solved("candidates", fitted, candidates, basis.measure if measure is None else measure)
     deviations = basis.sd if sd is None else checks.real("sd", sd)
     if deviations.shape not in ((), found.values.shape[1:]) or not (deviations > 0).all():
         raise ValueError(f"sd: expected positive numbers of shape () or {found.values.shape[1:]}, got {deviations}")
@@ -155,15 +157,14 @@ def next_experiment(
     return Experiments(int(np.nanargmin(merit)), errors, information)
 
 
-def _solved(fitted: Fit, commands: Numbers, measure: Measure) -> tuple[np.ndarray, Predicted]:
-    """Commands `(K, m)`, checked, and what is predicted under them."""
+def _solved(name: str, fitted: Fit, commands: Numbers, measure: Measure) -> tuple[np.ndarray, Predicted]:
+    """Commands `(K, m)`, the argument of this name, checked, and what is predicted under them."""
     basis = fitted.basis
-    checks.instance("fitted", fitted, Fit, "give what fit returned")
     checks.function("measure", measure, "(scene, x) to shape () or (p,)")
     scene = basis.model.scene(jnp.asarray(basis.flat))
-    rows = checks.numbers("commands", commands)
+    rows = checks.numbers(name, commands)
     if rows.ndim != 2 or rows.shape[1] != command_count(scene) or not len(rows):
-        raise ValueError(f"commands: expected shape (K, {command_count(scene)}), a row for each, got {rows.shape}")
-    check_commands("commands", scene, rows)
+        raise ValueError(f"{name}: expected shape (K, {command_count(scene)}), a row for each, got {rows.shape}")
+    check_commands(name, scene, rows)
     start = check(sweep(scene, rows, solver=basis.model.solver))
     return rows, predict_all(basis.model, basis.flat, rows, start.x, measure)

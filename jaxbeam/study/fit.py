@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from statistics import NormalDist
 from typing import Any
 
 import jax
@@ -31,9 +30,8 @@ from jaxbeam.study.fit_data import bounds_of, data_of, parameters_of
 from jaxbeam.study.known import ROUNDED, Known, scales_of, what_is_known
 from jaxbeam.study.least_squares import Residuals, least_squares
 from jaxbeam.study.observing import Design, Model, Predicted, model_of, predict_all
+from jaxbeam.study.outliers import outliers
 
-# Probability that of good residuals none is called an outlier.
-SURE = 0.99
 # Normal standard deviations beyond which a sum of squares is not called chance.
 CHANCE = 3.5
 # The median of the magnitude of a normal variable of unit variance.
@@ -57,7 +55,8 @@ class Fit:
     names: of the parameters, such as `young` or `young[3]`.
     values: `(N, p)` predictions.
     residuals: `(N, p)` predictions minus measurements, over their standard deviations; 0 for missing values.
-    outliers: `(k, 2)` observation and component of residuals that are too large to be chance.
+    outliers: `(k, 2)` observation and component of residuals that are too large to be chance, the largest first. A
+        huge one bends the fit so far that others look wrong: leave it out (infinite `sd`), and fit again.
     reduced_chi_square: sum of squared residuals over the degrees of freedom; near 1 if the model is right and the
         standard deviations are. If these are not known it is the variance of a measurement.
     degrees_of_freedom: number of data and priors less that of parameters that are determined.
@@ -325,7 +324,7 @@ def _fit(
         names=names,
         values=found.values,
         residuals=residuals,
-        outliers=_outliers(here, scales * free, np.isfinite(sd), known_sd, _round_off(found, sd)),
+        outliers=_outliers(here, scales * free, sd, known_sd),
         reduced_chi_square=float(chi_square),
         degrees_of_freedom=freedom,
         held=ended.held,
@@ -337,37 +336,11 @@ def _fit(
     )
 
 
-def _round_off(found: Predicted, sd: np.ndarray) -> np.ndarray:
-    """Residuals `(N, p)` that round-off may leave of each component: the root of that of one operation."""
-    return np.sqrt(np.finfo(found.x.dtype).eps) * np.abs(found.values).max(axis=0) / sd
-
-
-def _student(z: float, freedom: float) -> float:
-    """The quantile of Student's distribution where the normal one is `z` (Abramowitz and Stegun 1972, 26.7.5)."""
-    terms = ((z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
-    return z + sum(term / freedom**k for k, term in enumerate(terms, 1))
-
-
-def _outliers(
-    here: Residuals, scales: np.ndarray, present: np.ndarray, known_sd: bool, least: np.ndarray
-) -> np.ndarray:
-    """Observation and component `(k, 2)` of residuals that are too large to be chance, the largest first.
-
-    A residual is divided by its own standard deviation, which the fit makes smaller: `sqrt(1 - h)`, with `h` the
-    diagonal of the hat matrix (Cook and Weisberg 1982). Their size is taken from the median of the magnitudes, which
-    outliers hardly change, but where the standard deviations are known not as less than these: if all of them are given
-    too small, no value is worse than the others. The median tells a size as well as `WORTH` of all residuals would by
-    their squares, and so the limit is that of Student's distribution. What is round-off of the values is no outlier.
-    """
-    data = here.values[: present.size]
-    u, sizes, _ = np.linalg.svd(here.jacobian * scales, full_matrices=False)
-    hat = np.sum(u[: present.size, sizes > 1e-9 * sizes.max(initial=0)] ** 2, axis=1)
-    own = np.abs(data) / np.sqrt(np.maximum(1 - hat, 1e-6))
-    there = present.ravel()
-    size = max(float(known_sd), float(np.median(own[there])) / MEDIAN)
-    limit = NormalDist().inv_cdf(1 - (1 - SURE) / (2 * there.sum()))
-    if not known_sd:
-        limit = _student(limit, WORTH * max(1.0, there.sum() - hat.sum()))
-    large = np.flatnonzero(there & (own > limit * size) & (own > least.ravel()))
-    large = large[np.argsort(-own[large])]
-    return np.stack(np.unravel_index(large, present.shape), axis=1)
+def _outliers(here: Residuals, scales: np.ndarray, sd: np.ndarray, known_sd: bool) -> np.ndarray:
+    """Observation and component `(k, 2)` of residuals that are too large to be chance, the largest first."""
+    found, count = here.other, np.zeros(len(here.values), bool)
+    count[: sd.size] = np.isfinite(sd).ravel()
+    least = np.zeros(len(here.values))
+    least[: sd.size] = (np.sqrt(np.finfo(found.x.dtype).eps) * np.abs(found.values).max(axis=0) / sd).ravel()
+    named = outliers(here.values, here.jacobian * scales, count, least, known_sd)
+    return np.stack(np.unravel_index(named, sd.shape), axis=1)
