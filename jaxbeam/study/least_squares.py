@@ -17,8 +17,9 @@ import numpy as np
 
 from jaxbeam.study.design import DesignStatus
 
-# First damping, by what it is divided after a good step and multiplied after a bad one, and its range. Each further bad
-# step in a row multiplies it by twice as much as the one before (Nielsen 1999, report IMM-REP-1999-05).
+# First damping, by what it is divided after a step as good as predicted and multiplied after a bad one, and its range.
+# After others it depends on how good they were, and each further bad step in a row multiplies it by twice as much as
+# the one before (Nielsen 1999, report IMM-REP-1999-05).
 DAMPING, EASED, RAISED, LOWEST, HIGHEST = 1e-3, 8.0, 4.0, 1e-12, 1e12
 # Singular values below this share of the largest count as zero: derivatives are no more exact.
 BLIND = 1e-8
@@ -108,8 +109,10 @@ def least_squares(
         # A step to several bounds may lead uphill. A shorter one does not.
         new = residuals(trial, state.here) if fall > 0 else None
         state.trials += fall > 0
-        if new is not None and state.here.cost - new.cost >= WORTH * fall:
-            state.theta, state.here, damping, raised = trial, new, max(damping / EASED, LOWEST), RAISED
+        gain = (state.here.cost - new.cost) / fall if new is not None else -1.0
+        if new is not None and gain >= WORTH:
+            damping = max(damping * max(1 / EASED, 1 - (2 * gain - 1) ** 3), LOWEST)
+            state.theta, state.here, raised = trial, new, RAISED
             state.costs.append(new.cost)
         elif new is not None and fall <= LOST * state.here.cost:
             state.status = DesignStatus.REACHED

@@ -23,9 +23,9 @@ def search(function, start, low, high, max_steps=100):
     return least_squares(residuals, np.array(start, float), low, high, max_steps, lambda *told: None)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", [*range(20), 140, 157])
 def test_minimum_within_bounds_is_that_of_scipy(seed):
-    """With random bounds, of which some hold."""
+    """With random bounds, of which some hold. In the last two, full steps go back and forth about the minimum."""
     rng = np.random.default_rng(seed)
     data = decay(np.array([2.0, 1.5, 0.5]), 0)[0] + 0.1 * rng.normal(size=12)
     low, high = np.array([2.0, 1.5, 0.5]) + np.sort(rng.normal(size=(2, 3)), axis=0)
@@ -41,7 +41,8 @@ def test_minimum_within_bounds_is_that_of_scipy(seed):
         gtol=1e-15,
         max_nfev=2000,
     )
-    assert found.status == DesignStatus.REACHED and (low <= found.theta).all() and (found.theta <= high).all()
+    assert found.status == DesignStatus.REACHED and found.trials <= 40
+    assert (low <= found.theta).all() and (found.theta <= high).all()
     assert found.here.cost <= 2 * theirs.cost * (1 + 1e-9)  # theirs is half of the sum
     # Karush, Kuhn and Tucker: downhill is only out of the bounds that hold.
     slope = found.here.jacobian.T @ found.here.values
@@ -125,13 +126,15 @@ def test_an_exact_zero():
 
 def test_noisy_residuals_end_the_search():
     """Where the sum of squares is uncertain in its tenth digit the search ends there, and wastes few trials."""
-    data, rng = decay(np.array([2.0, 1.5, 0.5]), 0)[0] + 0.1 * np.cos(9 * TIMES), np.random.default_rng(0)
-
-    def function(theta):
-        r, J = decay(theta, data)
-        return r * (1 + 1e-10 * rng.normal(size=len(r))), J
-
-    found = search(function, [5.0, 0.5, 0.0], *FREE)
+    data = decay(np.array([2.0, 1.5, 0.5]), 0)[0] + 0.1 * np.cos(9 * TIMES)
     exact = search(lambda theta: decay(theta, data), [5.0, 0.5, 0.0], *FREE)
-    assert found.status == DesignStatus.REACHED and found.trials <= exact.trials + 3
-    np.testing.assert_allclose(found.theta, exact.theta, rtol=1e-4)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+
+        def function(theta, rng=rng):
+            r, J = decay(theta, data)
+            return r * (1 + 1e-9 * rng.normal(size=len(r))), J
+
+        found = search(function, [5.0, 0.5, 0.0], *FREE)
+        assert found.status == DesignStatus.REACHED and found.trials <= exact.trials + 2
+        np.testing.assert_allclose(found.theta, exact.theta, rtol=1e-4)
