@@ -12,7 +12,7 @@ import argparse
 import subprocess
 import sys
 
-NAMES = ("single", "many", "peers", "accuracy", "error_bars", "verification", "window")
+NAMES = ("single", "many", "peers", "accuracy", "error_bars", "verification", "window", "fitting")
 # It takes an hour, the others minutes each.
 BY_NAME = ("extremes",)
 
