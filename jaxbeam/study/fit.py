@@ -48,6 +48,7 @@ class Fit:
 
     theta: the parameters.
     errors: standard error of each, in the same structure; NaN where the data do not determine it, or a bound holds it.
+        One that a bound holds is taken as exact for the errors of the others.
     not_determined: what the data do not determine, in words; empty if they determine all.
     correlations: `(q, q)` of the parameters, in the order of `names`.
     singular_values: of the scaled Jacobian: by how many standard deviations the residuals change when a combination of
@@ -299,6 +300,9 @@ def _fit(
     freedom = count - rank
     chi_square = here.cost / freedom if freedom > 0 else np.nan
     variance = 1.0 if known_sd or not chi_square > 0 else chi_square
+    # A bound that holds what the data do not determine is no knowledge of it, and lends none to the others.
+    unbound = what_is_known(here.jacobian, scales, np.ones(len(free), bool), positive, names, variance)
+    free |= np.isnan(unbound.errors)
     known = what_is_known(here.jacobian, scales, free, positive, names, variance)
     residuals = here.values[: sd.size].reshape(sd.shape)
     typical = [np.median(part[np.isfinite(part)]) if np.isfinite(part).any() else np.inf for part in sd.T]

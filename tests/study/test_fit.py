@@ -115,6 +115,14 @@ def test_a_bound_holds_a_parameter(data, judge):
     assert "held at its bound" in str(found) and found.not_determined == []
 
 
+def test_a_bound_lends_no_knowledge(data):
+    """Positions determine a ratio. Where a bound stops one of the two moduli, the other is known no better."""
+    start, low = START | {"tendon": 3e3, "young": 1e3}, LOW | {"tendon": 2.9e3}
+    found = jb.fit(moduli, start, ROWS, data[:, :2], jb.tip_position, sd=SD[:2], bounds=(low, HIGH))
+    assert found.theta["tendon"] == 2.9e3 and found.not_determined == ["tendon and young only as a ratio"]
+    assert np.isnan(found.errors["young"]) and np.isfinite(found.errors["poisson"])
+
+
 def test_a_prior_is_further_residuals(data, judge):
     prior = lambda theta: jnp.stack([(theta["poisson"] - 0.45) / 0.01, jnp.log(theta["young"] / 9e3) / 0.1])
     found = fit_moduli(values=data, prior=prior)
