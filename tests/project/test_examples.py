@@ -3,6 +3,7 @@
 import importlib.util
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -23,6 +24,17 @@ NUMBERS = {
     "12_tentacle": {"lowest ratio": 0.7177, "top": 0.0445, "bottom": 0.1042},
     "13_gripper": {"ratio": 0.84478, "tension": 196.60},
     "14_pneumatic": {"pressure": 1288.04, "ratio": 0.8196, "tips apart": 0.684},
+    "15_fit": {
+        "parameters within 3 errors": 4.0,
+        "mistakes named": 1.0,
+        "known only as a ratio": 1.0,
+        "chi-square": 1.05,
+        "chi-square of the rod": 5.46,
+        "angles within": 11.0,
+        "angles missed by the rod": 11.0,
+        "next upper ratio": 0.75,
+        "next lower ratio": 0.60,
+    },
 }
 PICTURES = {
     "01_steer_beam": {"steer_beam.png", "gallery.png", "steer_top.gif", "steer_three.gif"},
@@ -39,6 +51,7 @@ PICTURES = {
     "12_tentacle": {"tentacle.png", "tentacle.gif"},
     "13_gripper": {"gripper.png", "gripper.gif"},
     "14_pneumatic": {"pneumatic.png", "pneumatic.gif"},
+    "15_fit": {"fit.png", "next.png"},
 }
 
 
@@ -50,14 +63,29 @@ def test_every_example_is_tested():
 NAMES = [name if name == "01_steer_beam" else pytest.param(name, marks=pytest.mark.slow) for name in NUMBERS]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_example(name, tmp_path):
+def loaded(name):
+    """The module of an example."""
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    found = module.main(tmp_path)
+    return module
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_example(name, tmp_path):
+    found = loaded(name).main(tmp_path)
     for key, expected in NUMBERS[name].items():
         digits = len(str(expected).split(".")[1])
         assert found[key] == pytest.approx(expected, abs=10.0**-digits)
     assert {path.name for path in tmp_path.iterdir()} == PICTURES[name]
     assert all(path.stat().st_size > 10_000 for path in tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_made_up_measurements_are_those_in_the_files(tmp_path):
+    """To the last digit that is written: one more or less where a number lies between two."""
+    example = loaded("15_fit")
+    example.make(tmp_path / "data.csv", tmp_path / "angles.csv")
+    for made, kept, digit in (("data.csv", example.DATA, 1e-2), ("angles.csv", example.TRUE_ANGLES, 1e-5)):
+        made, kept = (np.loadtxt(path, delimiter=",") for path in (tmp_path / made, kept))
+        np.testing.assert_allclose(made, kept, rtol=0, atol=1.01 * digit)
