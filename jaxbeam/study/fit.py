@@ -92,7 +92,7 @@ class Fit:
         lines = [f"Fit: {self.status.name} in {self.steps} steps, {self.solves} solves"]
         for name, value, error, held in zip(self.names[:12], flat, errors, self.held, strict=False):
             known = f"+- {error:.3g}" if np.isfinite(error) else "held at its bound" if held else "not determined"
-            lines.append(f"{name:<{width}}  {value:.8g} {known}")
+            lines.append(f"{name:<{width}}  {_as_exact(value, error)} {known}")
         if len(self.names) > 12:
             lines.append(f"... and {len(self.names) - 12} other parameters")
         lines += [f"not determined: {words}" for words in self.not_determined]
@@ -104,6 +104,14 @@ class Fit:
             each = ", ".join(f"{k} (component {j}, {self.residuals[k, j]:+.3g})" for k, j in self.outliers[:8].tolist())
             lines.append(f"outliers: observation {each}" + ", ..." * (len(self.outliers) > 8))
         return "\n  ".join(lines)
+
+
+def _as_exact(value: float, error: float) -> str:
+    """A value to the digits of its error, which has three; to four digits if there is no error."""
+    if not (np.isfinite(error) and error > 0 and value != 0):
+        return f"{value:.4g}"
+    digits = int(np.floor(np.log10(abs(value))) - np.floor(np.log10(error))) + 3
+    return f"{value:#.{min(max(digits, 3), 15)}g}".rstrip(".")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

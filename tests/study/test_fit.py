@@ -387,3 +387,19 @@ def test_a_start_without_equilibrium(data):
     rows = np.where(np.arange(10)[:, None] == 4, [[0.001, 1.0]], ROWS)
     with pytest.raises(jb.EquilibriumError, match=r"OVERLAPPING.*\b4\b"):
         jb.fit(moduli, START, rows, data, tip_and_tensions, sd=SD)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "shown"),
+    [
+        (0.45754095, 0.00508, "0.45754"),
+        (240.0, 0.273, "240.000"),
+        (1234567.0, 5.4, "1234567.00"),
+        (-2.5e-9, 3e-11, "-2.5000e-09"),
+        (0.3, 20.0, "0.300"),
+        (159.95814, np.nan, "160"),
+        (0.0, 1.0, "0"),
+    ],
+)
+def test_a_value_is_printed_to_the_digits_of_its_error(value, error, shown):
+    assert fitting._as_exact(value, error) == shown
