@@ -77,6 +77,7 @@ def cables(
     width: Numbers = 0.0,
     transition: Numbers = 0.01,
     shared: bool = False,
+    natural: Numbers | None = None,
 ) -> Term:
     """Tendons that only pull, at their natural length (ratio 1); `command` shortens them.
 
@@ -89,15 +90,16 @@ def cables(
         transition: stretch over which a slack cable becomes taut, relative to the natural length, positive; scalar or
             `(m,)`; differentiable. If it is small, the stiffness changes sharply, which is hard for Newton's method.
         shared: as for `tendons`.
+        natural: as for `tendons`; a cable with slack is longer than its ends are apart.
 
     Raises:
         ValueError: as `tendons` does, or if a transition is not positive and finite.
     """
-    term = tendons(mesh, nodes, modulus, stiffness, width, shared)
+    term = tendons(mesh, nodes, modulus, stiffness, width, shared, natural)
     shares = checks.numbers("transition", transition, checks.POSITIVE, ((), (len(term.nodes),)), "one for each cable")
-    natural = term.params.natural
-    xp = namespace(shares, natural)
-    return _as_cables(term, stiffness, xp.asarray(shares, mesh.nodes.dtype) * xp.asarray(natural))
+    lengths = term.params.natural
+    xp = namespace(shares, lengths)
+    return _as_cables(term, stiffness, xp.asarray(shares, mesh.nodes.dtype) * xp.asarray(lengths))
 
 
 def _as_cables(term: Term, stiffness: Callable[[jax.Array, jax.Array], jax.Array], transition: Any) -> Term:

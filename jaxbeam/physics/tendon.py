@@ -230,6 +230,7 @@ def tendons(
     stiffness: Callable[[jax.Array, jax.Array], jax.Array] = inverse_square_stiffness,
     width: Numbers = 0.0,
     shared: bool = False,
+    natural: Numbers | None = None,
 ) -> Term:
     """Tendons fixed to nodes of the mesh, at their natural length (ratio 1); `command` shortens them.
 
@@ -252,10 +253,13 @@ def tendons(
             At 0 the tendon pulls on the node alone. This is a point load: its answer has no limit as the mesh is
             refined.
         shared: whether one ratio commands all of them, in place of one each.
+        natural: natural length, of which ratios are; positive; scalar or `(m,)`; differentiable. By default the length
+            at rest. With another one the tendon pulls, or pushes, at ratio 1 too.
 
     Raises:
         ValueError: if a node is out of range, a tendon repeats a node, has no length or fewer than two
-            nodes, a concrete modulus is not positive and finite, a width is negative, or as `patch` does.
+            nodes, a concrete modulus or natural length is not positive and finite, a width is negative, or as
+            `patch` does.
     """
     check_law(stiffness)
     checks.flag("shared", shared)
@@ -269,16 +273,20 @@ def tendons(
     anchored: tuple[np.ndarray, ...] = ()
     if not widths.any():
         nodes_of, energy = lines, TendonEnergy(stiffness, at_nodes, shared)
-        natural = polyline_length(rest[lines])
+        lengths = polyline_length(rest[lines])
     else:
         nodes_of, weights = _patch_means(mesh, lines, widths)
         energy = TendonEnergy(stiffness, at_means, shared)
         anchored = (weights.astype(dtype), widths.astype(dtype), lines)
         places = from_first(np.asarray(rest)[nodes_of])
-        natural = polyline_length(np.einsum("mpk,mkd->mpd", weights, places).astype(dtype))
+        lengths = polyline_length(np.einsum("mpk,mkd->mpd", weights, places).astype(dtype))
+    if natural is not None:
+        given = checks.numbers("natural", natural, checks.POSITIVE, ((), lines.shape[:1]), "one for each tendon")
+        xp = namespace(given)
+        lengths = xp.broadcast_to(xp.asarray(given, dtype), lines.shape[:1])
     xp = namespace(modulus)
-    moduli = xp.broadcast_to(xp.asarray(modulus, dtype), natural.shape)
-    return Term(energy, nodes_of, TendonParams(natural, natural, moduli, *anchored))
+    moduli = xp.broadcast_to(xp.asarray(modulus, dtype), lengths.shape)
+    return Term(energy, nodes_of, TendonParams(lengths, lengths, moduli, *anchored))
 
 
 def check_lines(mesh: Mesh, nodes: Any) -> np.ndarray:
