@@ -62,6 +62,8 @@ class Fit:
         standard deviations are. If these are not known it is the variance of a measurement.
     degrees_of_freedom: number of data and priors less that of parameters that are determined.
     held: `(q,)` -1 or 1 where the lower or upper bound holds a parameter, else 0.
+    blocked: `(N,)` for how many of the parameter sets tried an observation had no equilibrium that is `OK`. Where that
+        stops a search, fit without these observations first, and start from what that finds.
     steps: number of parameter sets tried.
     solves: number of equilibria solved.
     status: `REACHED` at a minimum, else `NOT_CONVERGED`.
@@ -80,6 +82,7 @@ class Fit:
     reduced_chi_square: float
     degrees_of_freedom: int
     held: np.ndarray
+    blocked: np.ndarray
     steps: int
     solves: int
     status: DesignStatus
@@ -92,6 +95,7 @@ class Fit:
         lines = [f"Fit: {self.status.name} in {self.steps} steps, {self.solves} solves"]
         for name, value, error, held in zip(self.names[:12], flat, errors, self.held, strict=False):
             known = f"+- {error:.3g}" if np.isfinite(error) else "held at its bound" if held else "not determined"
+            known = "not converged" if self.status else known
             lines.append(f"{name:<{width}}  {_as_exact(value, error)} {known}")
         if len(self.names) > 12:
             lines.append(f"... and {len(self.names) - 12} other parameters")
@@ -103,6 +107,10 @@ class Fit:
         if len(self.outliers):
             each = ", ".join(f"{k} (component {j}, {self.residuals[k, j]:+.3g})" for k, j in self.outliers[:8].tolist())
             lines.append(f"outliers: observation {each}" + ", ..." * (len(self.outliers) > 8))
+        if self.status and self.blocked.any():
+            stuck = np.argsort(-self.blocked, kind="stable")[: min(8, np.count_nonzero(self.blocked))]
+            each = ", ".join(f"{k} ({self.blocked[k]} times)" for k in stuck)
+            lines.append(f"no equilibrium for what was tried: observation {each}; fit without, and start from that")
         return "\n  ".join(lines)
 
 
@@ -227,14 +235,14 @@ def fit(
             f"parameters, or give a prior"
         )
     model, beliefs = model_of(design, unravel, start, solver), _beliefs(prior, unravel)
-    solves = 0
+    solves, blocked = 0, np.zeros(len(rows), int)
     with Report(progress, f"steps of at most {max_steps}") as report:
         first = check(sweep(scene, rows, solver=solver))
 
         def residuals(flat: np.ndarray, before: Residuals | None) -> Residuals | None:
-            nonlocal solves
+            nonlocal solves, blocked
             found = predict_all(model, flat, rows, first.x if before is None else before.other.x, measure)
-            solves += len(rows)
+            solves, blocked = solves + len(rows), blocked + (found.status != 0)
             here = _residuals(found, data, deviations, *beliefs(flat))
             if before is None:
                 _check_start(here, names)
@@ -243,7 +251,7 @@ def fit(
         tell = lambda steps, cost: report(steps, f"sum of squares {cost:.4e}", (steps, cost))
         ended = least_squares(residuals, start, low, high, max_steps, tell)
     known_sd = sd is not None
-    return _fit(ended, model, measure, deviations, known_sd, start, names, unravel, solves)
+    return _fit(ended, model, measure, deviations, known_sd, start, names, unravel, solves, blocked)
 
 
 def _beliefs(prior: Prior | None, unravel: Callable[[jax.Array], Any]) -> Callable[[np.ndarray], tuple[Any, Any]]:
@@ -298,6 +306,7 @@ def _fit(
     names: list[str],
     unravel: Callable[[jax.Array], Any],
     solves: int,
+    blocked: np.ndarray,
 ) -> Fit:
     """The report of a search."""
     here, found, free = ended.here, ended.here.other, ended.held == 0
@@ -340,6 +349,7 @@ def _fit(
         reduced_chi_square=float(chi_square),
         degrees_of_freedom=freedom,
         held=ended.held,
+        blocked=blocked,
         steps=ended.trials,
         solves=solves,
         status=ended.status,
