@@ -21,8 +21,9 @@ from jaxbeam.core.compiling import usual_rules
 from jaxbeam.core.progress import Progress, Report, check_progress
 from jaxbeam.core.tree import Numbers
 from jaxbeam.scene.rigid import check_held
+from jaxbeam.scene.scene import Scene
 from jaxbeam.solve.newton import Newton, check_scene_and_solver
-from jaxbeam.solve.solution import check
+from jaxbeam.solve.solution import EquilibriumError, Solution, check
 from jaxbeam.solve.sweep import sweep
 from jaxbeam.study.design import DesignStatus
 from jaxbeam.study.expansion import Measure
@@ -237,7 +238,7 @@ def fit(
     model, beliefs = model_of(design, unravel, start, solver), _beliefs(prior, unravel)
     solves, blocked = 0, np.zeros(len(rows), int)
     with Report(progress, f"steps of at most {max_steps}") as report:
-        first = check(sweep(scene, rows, solver=solver))
+        first = _first_states(scene, rows, solver)
 
         def residuals(flat: np.ndarray, before: Residuals | None) -> Residuals | None:
             nonlocal solves, blocked
@@ -252,6 +253,16 @@ def fit(
         ended = least_squares(residuals, start, low, high, max_steps, tell)
     known_sd = sd is not None
     return _fit(ended, model, measure, deviations, known_sd, start, names, unravel, solves, blocked)
+
+
+def _first_states(scene: Scene, rows: np.ndarray, solver: Newton) -> Solution:
+    """The equilibria of all observations at `theta0`."""
+    try:
+        return check(sweep(scene, rows, solver=solver))
+    except EquilibriumError as error:
+        raise EquilibriumError(
+            f"{error}\nThese are observations at theta0: start from other parameters, or leave them out."
+        ) from None
 
 
 def _beliefs(prior: Prior | None, unravel: Callable[[jax.Array], Any]) -> Callable[[np.ndarray], tuple[Any, Any]]:
