@@ -103,6 +103,7 @@ def pulled():
     return scene, jb.check(jb.equilibrium(scene))
 
 
+@pytest.mark.slow
 def test_the_angle_of_the_reference_beam(pulled):
     """10.1407 degrees and a tension of 209.75 on the finest mesh of `benchmarks.accuracy`; 208 unknowns are 0.25 and
     0.65 % off. The error bar covers both."""

@@ -262,7 +262,7 @@ def critical_tension(length, nx, ny=3, poisson=0.0):
 SECOND_ORDER = np.pi**2 * (2 / 12 - 0.2)
 
 
-@pytest.mark.parametrize("poisson", [0.0, 0.3])
+@pytest.mark.parametrize("poisson", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_a_cable_buckles_a_column_at_eulers_load(poisson):
     """At `L / H = 60` within 1e-4. At `nu = 0` it is known to second order, and the mesh leaves 2.7e-5."""
     found = critical_tension(60.0, 61, poisson=poisson)

@@ -162,7 +162,7 @@ def under(obstacle, nx=15):
     ("obstacle", "ways"),
     [
         (jb.disk([1.0, 0.7], 0.3), {-0.3: -6.0, -1.0: -20.0}),
-        (jb.box([1.0, 0.7], [0.5, 0.6]), {-0.3: -6.0, -0.7: -15.0}),
+        pytest.param(jb.box([1.0, 0.7], [0.5, 0.6]), {-0.3: -6.0, -0.7: -15.0}, marks=pytest.mark.slow),
     ],
     ids=["disk", "box"],
 )

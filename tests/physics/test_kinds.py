@@ -71,8 +71,9 @@ def varied(scene, t):
 EVERY = [*KINDS, "pressure"]
 
 
-# Of kinds that are commanded alike, one is in the default run.
-USUAL = ("cable", "contact", "support", "pressure")
+# Of kinds that are commanded alike, one is in the default run; contact and supports have tests of their own.
+USUAL = ("cable", "pressure")
+VARIED = ("cable", "pull", "weight", "contact", "support", "pressure")
 
 
 @pytest.mark.parametrize("kind", [k if k in USUAL else pytest.param(k, marks=pytest.mark.slow) for k in EVERY])
@@ -93,7 +94,7 @@ def test_batches_sweeps_and_ramps(kind):
     np.testing.assert_allclose(swept.x[-1], alone.x, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", EVERY)
+@pytest.mark.parametrize("kind", [k if k in VARIED else pytest.param(k, marks=pytest.mark.slow) for k in EVERY])
 def test_derivatives_by_every_parameter(kind):
     scene, command = made(kind)
     scene = jb.command(scene, command)

@@ -312,6 +312,7 @@ def test_the_axes_grow_with_the_body_and_a_saved_picture_shows_it(window, tmp_pa
     assert body.sum() > 500
 
 
+@pytest.mark.slow
 def test_a_beam_under_pressure_and_a_rod_are_steered_too():
     rod = window_on(jb.rod_beam(5)).wait()
     offset = take_tip(rod)

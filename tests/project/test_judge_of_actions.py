@@ -147,7 +147,8 @@ def test_energy_and_its_derivatives_are_the_librarys(name, order):
 
 
 # Dear to compile; the order of its commands is compared above.
-DEAR = [pytest.param(name, marks=pytest.mark.slow) if name == "everything" else name for name in SCENES]
+COSTLY = ("everything", "turned", "box", "half-plane")
+DEAR = [pytest.param(name, marks=pytest.mark.slow) if name in COSTLY else name for name in SCENES]
 
 
 @pytest.mark.parametrize("name", DEAR)

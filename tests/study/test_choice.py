@@ -20,7 +20,7 @@ def test_the_table_has_an_error_for_every_value():
     assert [row.time for row in TABLE] == sorted(row.time for row in TABLE)
 
 
-@pytest.mark.parametrize("error", [0.1, 0.01, 0.001, 0.0001])
+@pytest.mark.parametrize("error", [0.1, 0.01, 0.001, pytest.param(0.0001, marks=pytest.mark.slow)])
 def test_what_is_chosen_errs_by_no_more(error):
     choice = jb.choose(error)
     assert choice.error <= error and choice.doubt == ""

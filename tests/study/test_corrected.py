@@ -20,7 +20,9 @@ def angle_and_tension(scene: jb.Scene, x: jax.Array) -> jax.Array:
     return jnp.stack([jb.tip_angle(scene, x), jb.tendon_tensions(scene, x)[0]])
 
 
-@pytest.mark.parametrize(("build", "ratios"), [(CROSSED, [0.9, 1.0]), (CURVED, [0.5, 0.75])])
+@pytest.mark.parametrize(
+    ("build", "ratios"), [pytest.param(CROSSED, [0.9, 1.0], marks=pytest.mark.slow), (CURVED, [0.5, 0.75])]
+)
 def test_fine_values_are_those_of_an_equilibrium_on_the_finer_mesh(build, ratios):
     meshes = jb.two_meshes(build())
     found = jb.corrected(meshes, ratios, angle_and_tension)
@@ -153,6 +155,7 @@ def test_each_measure_has_its_own_doubts():
     assert jb.Doubt(int(found.doubt[1])) & (jb.Doubt.WORST | jb.Doubt.CORNER) and np.isinf(found.bar[1])
 
 
+@pytest.mark.slow
 def test_a_surface_that_may_crease_has_no_bar():
     scene = jb.tendon_beam(9, 5, order=2, graded=True, length=1.6, anchor_width=0.25)
     found = jb.corrected(jb.two_meshes(scene), [[0.95, 1.0], [0.6, 1.0]], jb.tip_angle)

@@ -51,6 +51,7 @@ def test_prediction_and_its_error(fitted, judge):
     np.testing.assert_allclose(found.errors.ravel(), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_errors_of_predictions_are_the_scatter_of_fits(exact, fitted):
     """Of 60 fits a standard deviation is known to 9 %; 35 % are four of these."""
     found = jb.predict(fitted, NEW, jb.tip_angle)
