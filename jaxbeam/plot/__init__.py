@@ -1,7 +1,7 @@
 """Pictures and animations of beams. Only this folder needs matplotlib, so it must be imported by name.
 
     path = jb.ramp(scene, [0.5, 1.0])
-    states = plot.States(scene, path.ratios, path.x)
+    states = plot.States(scene, path)
     plot.save_animation(plot.animate_ramp(states, field=jb.nodal_von_mises_stress), "ramp.gif")
 
 One state

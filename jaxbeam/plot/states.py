@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.core import checks
 from jaxbeam.core.tree import Numbers
 from jaxbeam.plot.fields import Field
 from jaxbeam.scene.scene import Scene, command, command_count, commanded_terms
+from jaxbeam.solve.solution import Solution
 
 
 class States:
@@ -19,15 +21,20 @@ class States:
 
     Args:
         scene: with `n` nodes and `m` commands.
-        commands: `(s, m)`, such as ratios of tendons: `commands(ratios, steps)` for a ramp.
-        x: `(s, n, 2)` node positions: `Solution.x` of that ramp or sweep.
+        commands: `(s, m)`, such as ratios of tendons; or the `Solution` of a ramp or a sweep, which holds them and `x`.
+        x: `(s, n, d)` node positions.
         title: their name in pictures.
 
     Raises:
         ValueError: if a shape is wrong, there is no state, or a position is not finite.
     """
 
-    def __init__(self, scene: Scene, commands: Numbers, x: Numbers, title: str = "") -> None:
+    def __init__(self, scene: Scene, commands: Numbers | Solution, x: Numbers | None = None, title: str = "") -> None:
+        if isinstance(commands, Solution):
+            x, commands = commands.x, commands.ratios
+        if x is None:
+            raise ValueError("x: expected the positions of each state; give them, or a Solution in place of commands")
+        checks.instance("scene", scene, Scene, "the states are those of a scene")
         count = command_count(scene)
         self.scene, self.commands, self.x, self.title = scene, np.asarray(commands), np.asarray(x), title
         if self.commands.ndim != 2 or self.commands.shape[0] == 0 or self.commands.shape[1] != count:

@@ -150,6 +150,18 @@ def test_diverging_colours_are_even_about_the_centre(scene, shift, centre, middl
     np.testing.assert_allclose((body.norm.vmin + body.norm.vmax) / 2, middle, atol=1e-12)
 
 
+def test_a_solution_holds_its_states(scene):
+    path = jb.check(jb.ramp(scene, [0.9, 1.0], 4))
+    states = plot.States(scene, path, title="slowly")
+    assert states.title == "slowly"
+    np.testing.assert_array_equal(states.x, path.x)
+    np.testing.assert_array_equal(states.commands, path.ratios)
+    with pytest.raises(ValueError, match="x: expected the positions of each state"):
+        plot.States(scene, path.ratios)
+    with pytest.raises(ValueError, match=r"commands: expected shape \(s, 2\)"):
+        plot.States(scene, jb.equilibrium(scene))
+
+
 def test_curve_is_the_measure_against_the_ratio_that_varies_most(scene, states):
     ax = plot.curves([states])
     (line,) = ax.lines
