@@ -127,6 +127,15 @@ def small_beam(**kwargs) -> jb.Scene:
     return jb.tendon_beam(5, 3, density=counted, **kwargs)
 
 
+def slender_beam(nx: int) -> jb.Scene:
+    """A slender beam with a tendon from end to end on either side, on a mesh that is symmetric about mid-height."""
+    mesh = jb.rectangle(4.0, 0.3, nx, 3, diagonals="mirrored")
+    ends = jb.nearest_node(mesh, [[(-2.0, y), (2.0, y)] for y in (0.15, -0.15)])
+    left, right = (jb.nodes_where(mesh, lambda x, y, sign=sign: sign * x > 1.99) for sign in (-1, 1))
+    terms = jb.solid(mesh, jb.lame(1e4, 0.3)), jb.tendons(mesh, ends, 2e3)
+    return jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
+
+
 def supports(mesh: jb.Mesh, kind: str) -> np.ndarray:
     """`fixed` of a kind: left edge, both ends, a roller (one coordinate of some nodes) or one node only."""
     x = np.asarray(mesh.nodes)[:, 0]

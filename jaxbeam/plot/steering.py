@@ -111,11 +111,10 @@ class Steering:
             solver=self.solver,
         )
         status, held = DesignStatus(int(found.status)), np.asarray(found.held)
-        if status == DesignStatus.NOT_CONVERGED and self.last is not None:
-            text = (
-                "NOT_CONVERGED: the search for commands broke off; the last good state is shown. Drag in smaller steps"
-            )
-            return self._shown(self.last, np.zeros_like(held), target, [text])
+        if status == DesignStatus.NOT_CONVERGED:
+            shown = found.solution if self.last is None else self.last
+            text = "the search for commands broke off; the last good state is shown. Drag in smaller steps"
+            return self._shown(shown, np.zeros_like(held), target, [f"NOT_CONVERGED: {text}"])
         self._keep(found.solution)
         if status == DesignStatus.REACHED:
             return self._shown(found.solution, np.zeros_like(held), None, [])
@@ -126,8 +125,10 @@ class Steering:
         return self._shown(found.solution, held, target, [f"UNREACHABLE: this is the nearest point; {why}"])
 
     def stay(self) -> Shown:
-        """A drag to where the point is already: it compiles the search."""
-        assert self.measure is not None and self.last is not None
+        """A drag to where the point is already: it compiles the search. A state that is not OK is shown again instead."""
+        assert self.measure is not None
+        if self.last is None:
+            return self.begin()
         return self.drag(np.asarray(self.measure(self.scene, self.last.x)))
 
     def _origin(self, scene: Scene) -> Origin:

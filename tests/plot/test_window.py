@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slender_beam
 from matplotlib.backend_bases import KeyEvent, MouseButton, MouseEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
@@ -283,14 +284,18 @@ def test_a_solve_that_fails_is_told_and_the_next_goes_on_from_the_last_good_stat
     np.testing.assert_allclose(window.wait().shown.solution.x, solved(small_beam(), [0.93, 1.0]), atol=SOLVED)
 
 
+def test_a_window_may_begin_with_a_state_that_is_not_ok():
+    """Its remedy is shown, and a command that is fine is then solved from rest."""
+    window = window_on(jb.command(jb.tendon_beam(), [0.12, 1.0]), bounds=(0.1, 1.0)).wait()
+    assert window.view.said.startswith("OVERLAPPING: the body passes through itself")
+    window.pull([0.7, 1.0])
+    assert window.wait().view.said.startswith("OK")
+    np.testing.assert_allclose(window.shown.solution.x, solved(jb.tendon_beam(), [0.7, 1.0]), atol=SOLVED)
+
+
 def test_an_unstable_state_is_marked():
     """A slender beam that is pulled alike on both sides stays straight if the solver may stay on a saddle."""
-    mesh = jb.rectangle(4.0, 0.3, 13, 3, diagonals="mirrored")
-    ends = [[jb.nearest_node(mesh, (x, y)) for x in (-2.0, 2.0)] for y in (0.15, -0.15)]
-    left, right = (jb.nodes_where(mesh, lambda x, y, sign=sign: sign * x > 1.99) for sign in (-1, 1))
-    terms = jb.solid(mesh, jb.lame(1e4, 0.3)), jb.tendons(mesh, ends, 2e3)
-    scene = jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
-    window = window_on(scene, solver=jb.Newton(escape=False)).wait()
+    window = window_on(slender_beam(13), solver=jb.Newton(escape=False)).wait()
     window.pull([0.8, 0.8])
     assert int(window.wait().shown.solution.status) == jb.Status.UNSTABLE
     assert window.view.said.startswith("UNSTABLE: the equilibrium is a saddle")

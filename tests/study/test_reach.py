@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import small_beam
+from helpers import slender_beam, small_beam
 
 import jaxbeam as jb
 from jaxbeam.core.tree import replace
@@ -356,11 +356,7 @@ def test_a_search_goes_on_from_an_earlier_answer(beam):
 
 def test_a_search_stays_on_the_branch_that_it_starts_from():
     """A slender beam with tendons from end to end buckles up or down; pulled more at the top it can still hang down."""
-    mesh = jb.rectangle(4.0, 0.3, 21, 3, diagonals="mirrored")
-    ends = [[jb.nearest_node(mesh, (x, y)) for x in (-2.0, 2.0)] for y in (0.15, -0.15)]
-    left, right = (jb.nodes_where(mesh, lambda x, y, sign=sign: sign * x > 1.99) for sign in (-1, 1))
-    terms = jb.solid(mesh, jb.lame(1e4, 0.3)), jb.tendons(mesh, ends, 2e3)
-    beam = jb.Scene(mesh, terms, jb.clamped(mesh, left), right)
+    beam = slender_beam(21)
     pulled = jb.check(jb.equilibrium(jb.command(beam, [0.95, 0.9])))
     hanging = jb.check(jb.equilibrium(jb.command(beam, [0.9, 0.91]), pulled.x))
     target, bounds = float(jb.tip_angle(beam, hanging.x)) + 0.05, ([0.88, 0.905], [0.902, 0.92])
