@@ -98,11 +98,7 @@ def scales_of(field: Field, drawn: Sequence[tuple[Scene, np.ndarray]]) -> list[S
     Raises:
         ValueError: if the values have another shape or are not finite.
     """
-    places = [_at_nodes(field, scene, values.shape[1:]) for scene, values in drawn]
-    for at_nodes, (_, values) in zip(places, drawn, strict=True):
-        bad = np.argwhere(~np.isfinite(values))
-        if bad.size:
-            raise ValueError(f"values: {'node' if at_nodes else 'element'} {bad[0, -1]} is not finite")
+    places = [check_values(field, scene, values) for scene, values in drawn]
     every = np.concatenate([values.ravel() for _, values in drawn])
     centre = field.centre
     if centre is None and every.min() < 0 < every.max():
@@ -114,6 +110,19 @@ def scales_of(field: Field, drawn: Sequence[tuple[Scene, np.ndarray]]) -> list[S
     extend = ("neither", "min", "max", "both")[int(every.min() < low) + 2 * int(every.max() > high)]
     cmap = "viridis" if centre is None else "RdBu_r"
     return [Scale(cmap, Normalize(low, high), extend, at_nodes) for at_nodes in places]
+
+
+def check_values(field: Field, scene: Scene, values: np.ndarray) -> bool:
+    """Whether values `(s, n)` or `(s, t)` of a field in `s` states are those of nodes.
+
+    Raises:
+        ValueError: if they have another shape or are not finite.
+    """
+    at_nodes = _at_nodes(field, scene, values.shape[1:])
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        raise ValueError(f"values: {'node' if at_nodes else 'element'} {bad[0, -1]} is not finite")
+    return at_nodes
 
 
 def _at_nodes(field: Field, scene: Scene, shape: tuple[int, ...]) -> bool:

@@ -25,7 +25,7 @@ from jaxbeam.plot.drawing import (
     positions_of,
     prepare,
 )
-from jaxbeam.plot.fields import Field, Function, Scale, field_of, scales_of
+from jaxbeam.plot.fields import Field, Function, Scale, check_values, field_of, scales_of
 from jaxbeam.plot.lines import extremes
 from jaxbeam.plot.loads import Outside
 from jaxbeam.scene.scene import Scene, command
@@ -132,7 +132,7 @@ class Picture:
         state = self._acting.see(scene, positions_of(scene, x))
         self.values = self._values(state, values)
         if self.field and self.values is not None:
-            scales_of(self.field, [(scene, self.values[None])])
+            check_values(self.field, scene, self.values[None])
         self._panel.show(state, np.asarray(doing_of(scene, jnp.asarray(state.x))), self.values)
         self._panel.body.mark(trusted)
         return self.artists

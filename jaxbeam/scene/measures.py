@@ -152,6 +152,7 @@ def jacobians(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def stress_of(H: jax.Array, density: Callable[..., jax.Array], material: Any) -> jax.Array:
+    """Cauchy stress `(2, 2)` at a point: `P F^T / J`, as in `cauchy_stress`."""
     F = H + jnp.eye(2, dtype=H.dtype)
     return jax.grad(density)(H, material) @ F.T / jnp.linalg.det(F)
 

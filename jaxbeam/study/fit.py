@@ -35,10 +35,6 @@ from jaxbeam.study.outliers import outliers
 
 # Normal standard deviations beyond which a sum of squares is not called chance.
 CHANCE = 3.5
-# The median of the magnitude of a normal variable of unit variance.
-MEDIAN = 0.6745
-# Efficiency of that median as a measure of size, of normal variables (Huber 1981, Robust Statistics, ch. 5).
-WORTH = 0.37
 
 Prior = Callable[[Any], jax.Array]
 

@@ -40,14 +40,12 @@ class Predicted(NamedTuple):
     values: `(N, p)` measures.
     slopes: `(N, p, q)` their derivatives; NaN where the status is not `OK`.
     status: `(N,)` of the equilibria.
-    steps: `(N,)` Newton steps.
     """
 
     x: Any
     values: Any
     slopes: Any
     status: Any
-    steps: Any
 
 
 class Model(NamedTuple):
@@ -80,7 +78,6 @@ def predict_all(
     commands: np.ndarray,
     x: Any,
     measure: Measure,
-    tell: Callable[[int], None] = lambda solved: None,
 ) -> Predicted:
     """What is predicted by parameters `flat` `(q,)` under commands `(N, m)`, on all cores.
 
@@ -90,7 +87,6 @@ def predict_all(
         commands: one row for each observation.
         x: `(N, n, d)` states to start from, such as those of nearby parameters.
         measure: `(scene, x)` to `()` or `(p,)`.
-        tell: called with the number of observations that are solved.
     """
     count, starts = len(commands), np.asarray(x)
     blocks = [np.minimum(np.arange(k, k + BLOCK), count - 1) for k in range(0, count, BLOCK)]
@@ -104,10 +100,7 @@ def predict_all(
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         # The first block compiles the program: otherwise each thread would.
-        found = [solve(blocks[0])]
-        for part in pool.map(solve, blocks[1:]):
-            found.append(part)
-            tell(min(len(found) * BLOCK, count))
+        found = [solve(blocks[0]), *pool.map(solve, blocks[1:])]
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *found)
 
 
@@ -141,6 +134,6 @@ def _solve_block(
 
         values = outcome(flat)
         slopes = (jax.jacfwd if len(flat) <= len(values) else jax.jacrev)(outcome)(flat)
-        return Predicted(found, values, slopes, solution.status, solution.steps)
+        return Predicted(found, values, slopes, solution.status)
 
     return lax.map(one, (commands, x))
