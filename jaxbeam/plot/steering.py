@@ -125,7 +125,7 @@ class Steering:
         return self._shown(found.solution, held, target, [f"UNREACHABLE: this is the nearest point; {why}"])
 
     def stay(self) -> Shown:
-        """A drag to where the point is already: it compiles the search. A state that is not OK is shown again instead."""
+        """A drag to where the point is already: it compiles the search. A state that is not OK is shown again."""
         assert self.measure is not None
         if self.last is None:
             return self.begin()
